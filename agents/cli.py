@@ -67,17 +67,17 @@ def options_with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]
     """
     if rig is None:
         return options
-    from estimator.rig import Rig
+    from estimator.rigs.rig import Rig
 
     return {**options, "rig": Rig.of(rig).to_dict()}
 
 
 def iterate_with_progress(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
-    """Tasks, one after the other; `estimator.progress.progress` names the one at hand."""
-    from estimator.progress import progress
+    """Tasks, one after the other; `estimator.support.progress.show_progress` names the one at hand."""
+    from estimator.support.progress import show_progress
 
     tasks = list(tasks)
-    with progress() as on_progress:
+    with show_progress() as on_progress:
         for done, (name, task) in enumerate(tasks):
             on_progress(done / len(tasks), name)
             yield task
@@ -138,10 +138,10 @@ def check_track_id(env_id: str) -> None:
 
     from duffing_env import TRACKS
     from duffing_env.vector_env import DuffingVectorEnv
-    from estimator.checks import hint, shown
+    from estimator.support.argument_checks import did_you_mean, short_repr
 
     if not isinstance(env_id, str):
-        raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {shown(env_id)}")
+        raise ValueError(f"env must be the id of a track such as duffing_env/Short-v0, but is {short_repr(env_id)}")
     try:
         vector_env_class: Any = env_spec_of(env_id).vector_entry_point
         vector_env_class = load_env_creator(vector_env_class) if isinstance(vector_env_class, str) else vector_env_class
@@ -150,7 +150,7 @@ def check_track_id(env_id: str) -> None:
             f"env must be the id of a track such as duffing_env/Short-v0, but is {env_id}: {error}"
         ) from error
     except gym.error.Error as error:
-        remedy = "" if "/" in env_id else hint(f"duffing_env/{env_id}", TRACKS)
+        remedy = "" if "/" in env_id else did_you_mean(f"duffing_env/{env_id}", TRACKS)
         raise type(error)(
             f"env must be the id of a track such as duffing_env/Short-v0: {str(error).rstrip('.')}{remedy}"
         ) from error
@@ -236,21 +236,21 @@ def one_line_errors(program_name: str) -> Iterator[None]:
     except (KeyboardInterrupt, Interrupted) as interruption:
         resume_hint = ""
         if isinstance(interruption, Interrupted) and interruption.resume_hint:
-            from estimator.checks import printable
+            from estimator.support.argument_checks import mask_control_codes
 
-            resume_hint = f"; {printable(interruption.resume_hint)}"
+            resume_hint = f"; {mask_control_codes(interruption.resume_hint)}"
         print(f"{program_name}: stopped{resume_hint}", file=sys.stderr)
         sys.exit(128 + (interruption.signum if isinstance(interruption, Interrupted) else SIGINT))
     except Exception as error:
         from gymnasium.error import Error as GymnasiumError
 
-        from estimator.checks import printable
-        from estimator.extras import EXTRAS, how_to_get
+        from estimator.support.argument_checks import mask_control_codes
+        from estimator.support.optional_dependencies import EXTRA_OF_PACKAGE, install_hint
 
-        if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRAS:
-            print(f"{program_name}: {how_to_get(package)}", file=sys.stderr)
+        if isinstance(error, ModuleNotFoundError) and (package := str(error.name).split(".")[0]) in EXTRA_OF_PACKAGE:
+            print(f"{program_name}: {install_hint(package)}", file=sys.stderr)
         elif isinstance(error, ValueError | OSError | GymnasiumError):
-            print(f"{program_name}: {printable(' '.join(str(error).splitlines()))}", file=sys.stderr)
+            print(f"{program_name}: {mask_control_codes(' '.join(str(error).splitlines()))}", file=sys.stderr)
         else:
             raise
         sys.exit(2)

@@ -13,9 +13,9 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from estimator.checks import printable
-from estimator.files import check_place, write_atomically
-from estimator.progress import WIDTH
+from estimator.support.argument_checks import mask_control_codes
+from estimator.support.file_io import check_writable, write_atomically
+from estimator.support.progress import MAX_LINE_WIDTH
 
 
 def rich_console() -> Any:
@@ -23,14 +23,14 @@ def rich_console() -> Any:
     from rich.console import Console
 
     made = Console(highlight=False, markup=False, emoji=False)
-    made.width = min(WIDTH, made.width)
+    made.width = min(MAX_LINE_WIDTH, made.width)
     return made
 
 
 def print_wrapped(text: str, file: TextIO | None = None) -> None:
     """Print a text in lines of at most `WIDTH` characters; a word that is longer, such as a path, stays whole."""
-    for line in printable(text, "\n").split("\n"):
-        whole = textwrap.wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
+    for line in mask_control_codes(text, "\n").split("\n"):
+        whole = textwrap.wrap(line, MAX_LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
         print("\n".join(whole), file=file)
 
 
@@ -73,7 +73,7 @@ def format_table(
     from rich.box import MARKDOWN, SIMPLE_HEAD
     from rich.table import Table
 
-    cells = [[printable(cell, "\n") for cell in row] + [""] * (len(headings) - len(row)) for row in rows]
+    cells = [[mask_control_codes(cell, "\n") for cell in row] + [""] * (len(headings) - len(row)) for row in rows]
 
     def make_table(columns: Sequence[int]) -> Any:
         rich_table = Table(
@@ -158,7 +158,7 @@ def check_output_file(name: str, path: Path | None) -> None:
         return
     if path.is_dir():
         raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
-    check_place(path)
+    check_writable(path)
 
 
 def check_output_folder(name: str, path: Path) -> None:
@@ -171,7 +171,7 @@ def check_output_folder(name: str, path: Path) -> None:
     for place in (path, *path.parents):
         if place.exists() and not place.is_dir():
             raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
-    check_place(path)
+    check_writable(path)
 
 
 #: What the numbers of a result depend on.

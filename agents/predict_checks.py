@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import numbers, shown
+from estimator.support.argument_checks import short_repr, to_float_array
 
 #: Samples of a signal, or of a run, at most: two hours of the Silverbox's.
 MAX_SAMPLES = 2**22
@@ -17,7 +17,7 @@ def check_state(state: Any, n_arrays: int) -> None:
     """Refuse what no policy of so many arrays returned."""
     parts = state if isinstance(state, tuple) else (state,)
     if len(parts) != n_arrays or not all(isinstance(part, np.ndarray) and part.ndim for part in parts):
-        raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
+        raise ValueError(f"state must be what the last call returned, or None, but is {short_repr(state)}")
 
 
 def check_last_observation(env: Any, observations: npt.NDArray[Any]) -> None:
@@ -77,7 +77,7 @@ def episode_starts(episode_start: npt.ArrayLike | None, n_environments: int) -> 
     """
     if episode_start is None:
         return np.zeros(n_environments, dtype=np.bool_)
-    starting = np.atleast_1d(numbers("episode_start", episode_start)) != 0
+    starting = np.atleast_1d(to_float_array("episode_start", episode_start)) != 0
     if starting.ndim != 1:
         raise ValueError(f"episode_start must have shape ({n_environments},), but has {starting.shape}")
     check_batch_size("episode_start", len(starting), n_environments)

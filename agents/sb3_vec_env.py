@@ -13,10 +13,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from duffing_env.env_base import ReadOnlyOption, check_reset_options
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.extras import need
-from estimator.parameters import Parameters
+from estimator.support.array_types import Parameters
+from estimator.support.optional_dependencies import require_packages
 
-need("stable_baselines3")
+require_packages("stable_baselines3")
 from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
     VecEnvIndices,

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import BuiltinFunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
 
-from estimator.extras import EXTRAS
+from estimator.support.optional_dependencies import EXTRA_OF_PACKAGE
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -80,7 +80,7 @@ def attribute_user_errors(name_in_module: Any, role: str) -> Iterator[None]:
 
 
 def _needs_extra(error: BaseException) -> bool:
-    return isinstance(error, ModuleNotFoundError) and str(error.name).split(".")[0] in EXTRAS
+    return isinstance(error, ModuleNotFoundError) and str(error.name).split(".")[0] in EXTRA_OF_PACKAGE
 
 
 #: What the commands pass on themselves where they make a track, beside the options.
@@ -93,11 +93,11 @@ def check_env_options(options: Mapping[str, Any]) -> None:
     Raises:
         ValueError: naming the option.
     """
-    from estimator.checks import shown
+    from estimator.support.argument_checks import short_repr
 
     for name in _RESERVED_OPTIONS:
         if name in options:
-            raise ValueError(f"options must not hold {name}, but {name} is {shown(options[name])}; leave it out")
+            raise ValueError(f"options must not hold {name}, but {name} is {short_repr(options[name])}; leave it out")
 
 
 def env_spec_of(env_id: str) -> EnvSpec:

@@ -19,8 +19,8 @@ from duffing_env.storage.random_streams import new_stream_words
 from estimator.engine.tasks import structured
 from estimator.inference import mean_field
 from estimator.lanes import LANES, kernel
-from estimator.parameters import FloatArray
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.support.array_types import FloatArray
 
 NOISE = 5e-4
 SAMPLES = 256

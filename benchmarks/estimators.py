@@ -13,7 +13,7 @@ from duffing_env.plants.silverbox_record import load_record, record_available, s
 from estimator import SILVERBOX_TWIN, OnlineEstimator, coefficients_of, difference, duffing, silverbox_prior
 from estimator.belief import Belief
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 SAMPLES = 4096
 UNIT = "µs/sample"

@@ -18,7 +18,7 @@ from duffing_env.vector_env import ContinuousVectorEnv
 from estimator import OnlineEstimator, coefficients_of, duffing
 from estimator.belief import Belief
 from estimator.inference import EXPECTATIONS
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 LEVEL = 0.90
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))

@@ -120,7 +120,7 @@ def row(name: str) -> Run:
     """The row of this name, set up.
 
     A kind of environment and a number of them; ``silverbox`` and what `benchmarks.silverbox_peer_filters.row` takes; or
-    ``rigs`` and what `benchmarks.rigs.peer_rows.row` takes.
+    ``rigs`` and what `benchmarks.rigs.peer_methods.row` takes.
     """
     kind, _, rest = name.partition(" ")
     modules = {"silverbox": ("silverbox_peer_filters", ""), "rigs": ("peer_rows", "rigs")}

@@ -23,9 +23,9 @@ from estimator import (
     silverbox_prior,
 )
 from estimator.belief import Belief
-from estimator.models.difference import PRESETS, Term
-from estimator.parameters import FloatArray
+from estimator.models.difference_equation import PRESETS, Term
 from estimator.priors import log_uniform_moments
+from estimator.support.array_types import FloatArray
 
 POPULATIONS = ("paper", "offset", "three-tap", "cubic", "ode", "wide")
 

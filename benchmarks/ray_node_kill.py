@@ -19,7 +19,7 @@ from pathlib import Path
 from signal import SIGKILL, SIGSTOP
 
 from agents.console_output import format_table, print_texts_and_tables
-from estimator.extras import need
+from estimator.support.optional_dependencies import require_packages
 
 ROOT = Path(__file__).parents[1]
 
@@ -103,7 +103,7 @@ def signal_all(pids: list[int], signal: int) -> None:
 
 def main() -> int:
     """Print the table; the number of seeds that are not as they should be."""
-    need("ray")
+    require_packages("ray")
     from ray.cluster_utils import Cluster
 
     with tempfile.TemporaryDirectory() as folder:

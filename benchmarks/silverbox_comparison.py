@@ -21,8 +21,8 @@ from benchmarks.timed_rounds import Result, Row, measure, timed
 from duffing_env.plants.silverbox_record import Regime
 from estimator import OnlineEstimator
 from estimator.belief import Belief
-from estimator.models.difference import PRESETS
-from estimator.parameters import FloatArray
+from estimator.models.difference_equation import PRESETS
+from estimator.support.array_types import FloatArray
 from research.studies.silverbox_protocol import (
     N_GIVEN_OUTPUTS,
     SETTINGS,

@@ -27,7 +27,7 @@ from duffing_env.plants.silverbox_record import record_available
 from duffing_env.tracks.track_registry import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import check_record, covariance_places
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 
 _ROWS = 1024

@@ -15,10 +15,10 @@ from agents.console_output import format_table, print_texts_and_tables, write_js
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy
 from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
-from benchmarks.rigs.judge import calibrated
+from benchmarks.rigs.calibration import judge_coverage
 from estimator.ensemble import Hypotheses
-from estimator.parameters import FloatArray
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.support.array_types import FloatArray
 
 #: Track to the policies that are played on it, which know no more of the noises than the track says.
 PLAYED = {
@@ -116,7 +116,7 @@ def rows(cells: list[Cell], known: Cell) -> list[list[str]]:
 def verdict(cells: list[Cell], known: Cell) -> dict[str, Any]:
     """Whether the cells are calibrated, and none loses too much."""
     hits = [int(count) for cell in cells for count in cell.inside.sum(axis=0)]
-    pooled, meets, is_calibrated = calibrated(hits, [len(known.density)] * len(hits))
+    pooled, meets, is_calibrated = judge_coverage(hits, [len(known.density)] * len(hits))
     lost = [float((known.density - cell.density).mean()) for cell in cells]
     good = {
         f"calibrated; pooled coverage {pooled:.3f}, {len(meets) - sum(meets)} of {len(meets)} cells outside": (

@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.belief import covariance_places
-from estimator.checks import shown, whole
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.physical import propagate
-from estimator.units import VOLTS, Scales
+from estimator.rigs.physical_parameters import propagate_to_physical
+from estimator.rigs.units import VOLT_SCALES, Scales
+from estimator.support.argument_checks import check_integer, short_repr
+from estimator.support.array_types import FloatArray
 
 if TYPE_CHECKING:
     from duffing_env.batch import Batch
@@ -50,7 +50,7 @@ class Beliefs:
 
     model: Model
     records: FloatArray
-    scales: Scales = VOLTS
+    scales: Scales = VOLT_SCALES
 
     @property
     def mean(self) -> FloatArray:
@@ -80,14 +80,16 @@ class Beliefs:
 
     def physical(self) -> tuple[FloatArray, FloatArray]:
         """Means (n, p) and covariances (n, p, p) of the physical parameters, as `estimator.Belief.physical`."""
-        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
+        return propagate_to_physical(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
 
 
 def check_observation(observation: Any, history: int) -> None:
     """Refuse what is no observation, or no number of steps."""
     if not callable(observation) and not (isinstance(observation, str) and observation in OBSERVATIONS):
-        raise ValueError(f"observation must be one of {list(OBSERVATIONS)} or a function, but is {shown(observation)}")
-    whole("history", history, MAX_HISTORY)
+        raise ValueError(
+            f"observation must be one of {list(OBSERVATIONS)} or a function, but is {short_repr(observation)}"
+        )
+    check_integer("history", history, MAX_HISTORY)
 
 
 def experiment_observation_bounds(experiment: Experiment) -> FloatArray:

@@ -24,8 +24,8 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
 from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
-from estimator.checks import numbers, one_of, shown
-from estimator.parameters import Parameters
+from estimator.support.argument_checks import check_choice, short_repr, to_float_array
+from estimator.support.array_types import Parameters
 
 if TYPE_CHECKING:
     from duffing_env.rendering.episode_renderer import EpisodeRenderer
@@ -196,7 +196,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         if render_mode is not None:
-            one_of("render_mode", render_mode, self.metadata["render_modes"])
+            check_choice("render_mode", render_mode, self.metadata["render_modes"])
         self.experiment = make_experiment(self.experiment_class, options)
         self.observation_space = observation_space(self.experiment)
         self.action_space = action_space()
@@ -345,12 +345,12 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
 
 def _scalar_action(action: npt.ArrayLike) -> float:
     try:
-        given = action if type(action) is np.ndarray else numbers("action", action)
+        given = action if type(action) is np.ndarray else to_float_array("action", action)
         item = given.item() if given.size == 1 else math.nan
         value = math.nan if isinstance(item, str | bytes) else float(item)  # float() reads text, too
     except (TypeError, ValueError, OverflowError):
         value = math.nan
     if not math.isfinite(value):
         remedy = "; pass action.detach()" if getattr(action, "requires_grad", False) else ""
-        raise ValueError(f"action must be one finite number in [-1, 1], but is {shown(action)}{remedy}")
+        raise ValueError(f"action must be one finite number in [-1, 1], but is {short_repr(action)}{remedy}")
     return min(max(value, -1.0), 1.0)

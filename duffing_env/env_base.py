@@ -18,8 +18,8 @@ from gymnasium.vector import AutoresetMode
 from duffing_env.batch import Batch
 from duffing_env.custom_functions import CustomFunctions, experiment_observation_bounds
 from duffing_env.experiment_config import Experiment
-from estimator.checks import hint, shown
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import did_you_mean, short_repr
+from estimator.support.array_types import FloatArray
 
 MethodType = TypeVar("MethodType", bound=Callable[..., Any])
 
@@ -100,7 +100,7 @@ class ReadOnlyOption:
             env.__dict__[self._name] = value
             return
         raise AttributeError(
-            f"{self._name} cannot be set to {shown(value)} in an environment that is made already; make a new one with "
+            f"{self._name} cannot be set to {short_repr(value)} in an environment that is made already; make a new one with "
             f"{self._name}=..., or choose the system of an episode with reset(options={{'truth': ...}})"
         )
 
@@ -195,7 +195,7 @@ def make_experiment(experiment_class: type[Experiment], options: dict[str, Any])
         if name not in option_names:
             raise UnknownOption(
                 f"got an unexpected keyword argument {name!r}: the options of this environment are {option_names}"
-                f"{hint(name, option_names)}"
+                f"{did_you_mean(name, option_names)}"
             )
     return experiment_class(**options)
 

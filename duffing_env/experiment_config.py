@@ -18,15 +18,23 @@ from duffing_env.rewards.reward_registry import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
 from estimator.belief import Belief
-from estimator.checks import LARGEST, SMALLEST, flag, number, one_of, shown, whole
 from estimator.ensemble import Hypotheses, first_weights, priors, start
 from estimator.inference import DEFAULT_ITERATIONS, MOST_ITERATIONS
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.priors import log_uniform_moments, weak_prior
+from estimator.rigs.units import Scales
 from estimator.settings import checked_hypotheses
-from estimator.units import Scales
+from estimator.support.argument_checks import (
+    MAX_MAGNITUDE,
+    MIN_MAGNITUDE,
+    check_bool,
+    check_choice,
+    check_integer,
+    check_number,
+    short_repr,
+)
+from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 
 #: More ratios of the noises, or values of each, than are worth their time.
 MAX_HYPOTHESES = 99
@@ -61,20 +69,22 @@ class Experiment:
     uses_cubature: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        one_of("branch", self.branch, SEED_BRANCHES)
-        one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
+        check_choice("branch", self.branch, SEED_BRANCHES)
+        check_choice("factorisation", self.factorisation, DEFAULT_ITERATIONS)
         if self.iterations is not None:
-            whole("iterations", self.iterations, MOST_ITERATIONS)
+            check_integer("iterations", self.iterations, MOST_ITERATIONS)
         check_reward(self.reward)
         if callable(self.reward) and (self.terminal or self.terminated_return is not None):
             raise ValueError("terminal and terminated_return must be left out with a reward of one's own")
         check_observation(self.observation, self.history)
         for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
-            number(name, getattr(self, name), high=1e300)
-        whole("hold", self.hold, MAX_SAMPLES)
-        flag("terminal", self.terminal)
+            check_number(name, getattr(self, name), maximum=1e300)
+        check_integer("hold", self.hold, MAX_SAMPLES)
+        check_bool("terminal", self.terminal)
         if self.terminated_return is not None:
-            number("terminated_return", self.terminated_return, -LARGEST, LARGEST, "None keeps what was gained")
+            check_number(
+                "terminated_return", self.terminated_return, -MAX_MAGNITUDE, MAX_MAGNITUDE, "None keeps what was gained"
+            )
         hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MAX_HYPOTHESES)
         object.__setattr__(self, "noise_hypotheses", hypotheses)
 
@@ -106,7 +116,7 @@ class Experiment:
     @property
     def step(self) -> float:
         """Sampling step [s]."""
-        return SAMPLING_STEP
+        return SILVERBOX_SAMPLING_STEP
 
     @property
     def scales(self) -> Scales:
@@ -121,7 +131,7 @@ class Experiment:
     @property
     def nominal_parameters(self) -> dict[str, float]:
         """The plant in the middle of the range: the Silverbox circuit's as a model of it sees it, 1 of other models."""
-        twin = CONTINUOUS_TWIN if self.truth_model.is_continuous else SILVERBOX_TWIN
+        twin = SILVERBOX_ODE_TWIN if self.truth_model.is_continuous else SILVERBOX_TWIN
         return {name: twin.get(name, 1.0) for name in parameter_names(self.truth_model)}
 
     @property
@@ -211,18 +221,18 @@ class SimulatedExperiment(Experiment):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole("horizon", self.horizon, MAX_SAMPLES)
+        check_integer("horizon", self.horizon, MAX_SAMPLES)
         for name in ("process_noise", "measurement_noise", "noise_shape"):
-            number(name, getattr(self, name))
-        number("spread", self.spread, *SPREAD_LIMITS, "masses are positive, and none is known so well before")
+            check_number(name, getattr(self, name))
+        check_number("spread", self.spread, *SPREAD_LIMITS, "masses are positive, and none is known so well before")
         if self.plant_spread is not None:
-            number("plant_spread", self.plant_spread, 0, SPREAD_LIMITS[1], "0 is the twin itself")
+            check_number("plant_spread", self.plant_spread, 0, SPREAD_LIMITS[1], "0 is the twin itself")
         for name in ("max_rms", "max_slew", "process_noise_guess", "measurement_noise_guess"):
             if getattr(self, name) is not None:
-                number(name, getattr(self, name))
-        number("noise_range", self.noise_range, 1, LARGEST, "1 draws no noises")
-        for name, limit in (("input_cost", LARGEST), ("jump", SPREAD_LIMITS[1]), ("drift", 1.0)):
-            number(name, getattr(self, name), 0, limit, "0 does without it")
+                check_number(name, getattr(self, name))
+        check_number("noise_range", self.noise_range, 1, MAX_MAGNITUDE, "1 draws no noises")
+        for name, limit in (("input_cost", MAX_MAGNITUDE), ("jump", SPREAD_LIMITS[1]), ("drift", 1.0)):
+            check_number(name, getattr(self, name), 0, limit, "0 does without it")
         check_nominal_parameters(self.mean, parameter_names(self.plant))
         if self.prior is not None:
             check_prior(self.prior, self.scales, self.model)
@@ -296,15 +306,15 @@ def check_nominal_parameters(means: Mapping[str, float] | None, names: Sequence[
     if means is None:
         return
     if not isinstance(means, Mapping) or not set(means) <= set(names):
-        raise ValueError(f"mean must give some of the parameters {list(names)}, but is {shown(means)}")
+        raise ValueError(f"mean must give some of the parameters {list(names)}, but is {short_repr(means)}")
     for name, value in means.items():
-        number(f"mean[{name!r}]", value, SMALLEST if name == "m" else -LARGEST)
+        check_number(f"mean[{name!r}]", value, MIN_MAGNITUDE if name == "m" else -MAX_MAGNITUDE)
 
 
 def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
     """Refuse what is not a belief, or one in other scales, or of another model where that is given."""
     if not isinstance(prior, Belief):
-        raise ValueError(f"prior must be an estimator.Belief or None, but is {shown(prior)}")
+        raise ValueError(f"prior must be an estimator.Belief or None, but is {short_repr(prior)}")
     if prior.scales != scales:
         pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
         scale_words = {"input": "limit", "output": "range", "order": "time derivative that the sensor shows"}

@@ -32,8 +32,8 @@ from duffing_env.storage.kernel_spec import OUTCOME_ROWS
 from duffing_env.tracks.continuous_tracks import ContinuousEnv
 from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from estimator.belief import Belief
-from estimator.checks import MOST_SEED, numbers, shown, whole
-from estimator.parameters import FloatArray, Parameters
+from estimator.support.argument_checks import MAX_SEED, check_integer, short_repr, to_float_array
+from estimator.support.array_types import FloatArray, Parameters
 
 _RESET_MODES = {
     AutoresetMode.DISABLED: RESET_MANUALLY,
@@ -113,11 +113,11 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        whole("num_envs", num_envs, MAX_ENVS)
-        whole("threads", threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        check_integer("num_envs", num_envs, MAX_ENVS)
+        check_integer("threads", threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         limit = None if max_episode_steps == -1 else max_episode_steps
         if limit is not None:
-            whole("max_episode_steps", limit, MAX_SAMPLES)
+            check_integer("max_episode_steps", limit, MAX_SAMPLES)
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, but is {render_mode!r}; render a single environment")
         try:
@@ -213,7 +213,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
             gymnasium.error.ResetNeeded: before the first reset; with ``DISABLED`` also for finished rows.
         """
         if type(actions) is not np.ndarray or actions.dtype.kind != "f":
-            actions = numbers("actions", actions)  # type: ignore[assignment]
+            actions = to_float_array("actions", actions)  # type: ignore[assignment]
         if actions.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
         inputs = actions[:, 0]
@@ -262,7 +262,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
         if not (fits and mask.any()):
             raise ValueError(
-                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {shown(mask)}"
+                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {short_repr(mask)}"
             )
         return mask
 
@@ -270,18 +270,18 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         """Start the rows' streams of random numbers, each from an ``np_random`` of its own."""
         seeds: Sequence[int | None] = [None] * self.num_envs
         if isinstance(seed, int | np.integer):
-            whole("seed", seed, MOST_SEED, 0)
+            check_integer("seed", seed, MAX_SEED, 0)
             seeds = spawn_seeds(int(seed), self.num_envs)
         elif seed is not None:
             is_list = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes)
             seeds = list(seed) if is_list and getattr(seed, "shape", None) != () else []
             if len(seeds) != self.num_envs:
                 raise ValueError(
-                    f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {shown(seed)}"
+                    f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {short_repr(seed)}"
                 )
             for row, each in enumerate(seeds):
                 if each is not None:
-                    whole(f"seed[{row}]", each, MOST_SEED, 0)
+                    check_integer(f"seed[{row}]", each, MAX_SEED, 0)
         # All that can fail has been done.
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))

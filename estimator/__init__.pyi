@@ -2,23 +2,23 @@
 from .belief import Belief
 from .ensemble import NoiseRatio
 from .identification import identify
-from .identification.result import Result
+from .identification.identification_result import Result
 from .information import cramer_rao, fisher_information, relative_covariance
-from .models.difference import difference
+from .models.difference_equation import difference
 from .models.duffing import duffing
 from .models.model import Model
 from .offline import PEMNARX
 from .online import OnlineEstimator
-from .parameters import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
-from .physical import coefficients_of, to_physical
 from .priors import paper_text_prior, published_run_prior, recorded_prior, silverbox_prior, weak_prior
-from .rig import Channel, Rig
+from .rigs.physical_parameters import coefficients_of, to_physical
+from .rigs.rig import Channel, Rig
 from .saving import load_estimator, save_estimator
+from .support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 
 __all__ = [
-    "CONTINUOUS_TWIN",
     "PEMNARX",
-    "SAMPLING_STEP",
+    "SILVERBOX_ODE_TWIN",
+    "SILVERBOX_SAMPLING_STEP",
     "SILVERBOX_TWIN",
     "Belief",
     "Channel",

@@ -10,13 +10,13 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import number, numbers, one_of, shown
 from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.physical import propagate
-from estimator.units import SIZES, VOLTS, Scales
+from estimator.rigs.physical_parameters import propagate_to_physical
+from estimator.rigs.units import MAGNITUDE_BOUNDS, VOLT_SCALES, Scales
+from estimator.support.argument_checks import check_choice, check_number, short_repr, to_float_array
+from estimator.support.array_types import FloatArray
 
 
 @cache
@@ -53,7 +53,7 @@ def check_record(what: str, model: Model, record: FloatArray, rounding: float) -
         bad = belief_names(model)[int(np.argmin(np.isfinite(record)))]
         raise ValueError(f"{what} must be finite, but {bad} is not; replace it")
     d = len(model.names)
-    most = np.where(np.arange(len(record)) < d, SIZES[1], SIZES[1] ** 2)
+    most = np.where(np.arange(len(record)) < d, MAGNITUDE_BOUNDS[1], MAGNITUDE_BOUNDS[1] ** 2)
     if (beyond := np.abs(record) > most).any():
         place = int(np.argmax(beyond))
         raise ValueError(
@@ -94,15 +94,15 @@ class Belief:
 
     model: Model
     record: FloatArray
-    scales: Scales = VOLTS
+    scales: Scales = VOLT_SCALES
     factorisation: str = "structured"
 
     def __post_init__(self) -> None:
-        Model.checked(self.model)
-        one_of("factorisation", self.factorisation, DEFAULT_ITERATIONS)
+        Model.require_model(self.model)
+        check_choice("factorisation", self.factorisation, DEFAULT_ITERATIONS)
         if not isinstance(self.scales, Scales):
-            raise ValueError(f"scales must be a Scales, but is {shown(self.scales)}; use a rig's")
-        record = numbers("record", self.record)
+            raise ValueError(f"scales must be a Scales, but is {short_repr(self.scales)}; use a rig's")
+        record = to_float_array("record", self.record)
         if record.shape != (record_size(self.model),):
             raise ValueError(
                 f"record must have shape {(record_size(self.model),)} for the model {self.model.name!r}, but has "
@@ -140,19 +140,19 @@ class Belief:
         Raises:
             ValueError: as the class, or for shapes that do not fit.
         """
-        d = len(Model.checked(model).names)
-        first, second = numbers("mean", mean), numbers("cov", cov)
+        d = len(Model.require_model(model).names)
+        first, second = to_float_array("mean", mean), to_float_array("cov", cov)
         if first.shape != (d,) or second.shape != (d, d):
             raise ValueError(
                 f"mean and cov must have shapes {(d,)} and {(d, d)} for the model {model.name!r}, but have "
                 f"{first.shape} and {second.shape}"
             )
-        noises = np.concatenate([numbers("gamma", gamma).ravel(), numbers("xi", xi).ravel()])
+        noises = np.concatenate([to_float_array("gamma", gamma).ravel(), to_float_array("xi", xi).ravel()])
         record = np.empty(record_size(model))
         if np.size(gamma) != 2 or len(noises) != 2 + 2 * model.n_outputs:
             raise ValueError(
-                f"gamma must be a pair, and xi one for each of {list(model.outputs)}, but are {shown(gamma)} and "
-                f"{shown(xi)}"
+                f"gamma must be a pair, and xi one for each of {list(model.outputs)}, but are {short_repr(gamma)} and "
+                f"{short_repr(xi)}"
             )
         # As correlations: rounding leaves a covariance near 0 in no proportion to itself.
         std = np.sqrt(np.abs(np.diag(second)))
@@ -278,7 +278,7 @@ class Belief:
         Raises:
             ValueError: for a wrong shape, or values that are not finite.
         """
-        points = numbers("coefficients", coefficients)
+        points = to_float_array("coefficients", coefficients)
         size = len(self.coefficients_mean)
         if points.ndim == 0 or points.shape[-1] != size:
             raise ValueError(f"coefficients must have shape (..., {size}), but has {points.shape}; pass one per name")
@@ -306,7 +306,7 @@ class Belief:
 
         In the units of ``scales``.
         """
-        return propagate(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
+        return propagate_to_physical(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
 
     def parameters(self) -> dict[str, tuple[float, float, str]]:
         """Mean, standard deviation and unit of each physical parameter, by name."""
@@ -321,7 +321,7 @@ class Belief:
         Raises:
             ValueError: for a probability that is not between 0 and 1.
         """
-        number("probability", probability, 1e-12, 1 - 1e-12, "0.9 is usual")
+        check_number("probability", probability, 1e-12, 1 - 1e-12, "0.9 is usual")
         from scipy.special import ndtri
 
         half = float(ndtri(0.5 + probability / 2))

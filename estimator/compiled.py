@@ -24,8 +24,8 @@ from typing import Any
 import numba
 from llvmlite import binding
 
-from estimator.files import write_atomically
 from estimator.numba_internals import CompileResult, _Cache, dumps, event, rtsys
+from estimator.support.file_io import write_atomically
 
 
 @cache

@@ -26,7 +26,7 @@ import numpy as np
 from estimator.belief import Belief
 from estimator.inference.mixture import mixing
 from estimator.lanes import LANES
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Furthest displacement of σ_w/σ_v from that of the prior, either way.
 FARTHEST = 30.0

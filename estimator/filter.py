@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief, check_record, covariance_places
-from estimator.checks import numbers
 from estimator.ensemble import NoiseRatio, first_weights, log_ratio, priors, ratio_of, side_by_side
 from estimator.inference import samples
 from estimator.inference.mixture import mixing
 from estimator.inputs import Feed, degree, feed
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
-from estimator.rig_prior import balance
+from estimator.rigs.rig import Rig
+from estimator.rigs.rig_prior import equal_effect_log_ratio
+from estimator.rigs.units import MAGNITUDE_BOUNDS
 from estimator.settings import Settings
-from estimator.units import SIZES
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import FloatArray
 
 #: Shape of a Gamma belief that further samples do not move.
 _CERTAIN = 1e15
@@ -62,7 +62,7 @@ class Filter:
     def _begun_with(self, records: FloatArray) -> FloatArray:
         """(members,) the first weights. Of a rig whose guess is a prior, each noise is unknown by itself."""
         unknown = self.rig.guess is not None and isinstance(self.settings.noise_hypotheses, tuple)
-        return first_weights(records, balance(self.prior) if unknown else None)
+        return first_weights(records, equal_effect_log_ratio(self.prior) if unknown else None)
 
     def _compiled(self, members: int) -> samples.Loop:
         settings = self.settings
@@ -184,7 +184,7 @@ class Filter:
             return self.known().follow(u, y)[:, :, 0]
         t1, t2, t3, eta = self.belief.coefficients_mean
         predicted, last = y.copy(), y[1:-1, 0]
-        acting = np.concatenate([np.zeros(self.rig.whole_delay), u])[2 : len(y)]
+        acting = np.concatenate([np.zeros(self.rig.integer_delay), u])[2 : len(y)]
         predicted[2:, 0] = t1 * last + t2 * last**3 + t3 * y[:-2, 0] + eta * acting
         return predicted
 
@@ -275,7 +275,7 @@ class Filter:
 
 def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
     """A copy of an array of the right kind."""
-    array = numbers(name, value)
+    array = to_float_array(name, value)
     if np.asarray(value).dtype != np.float64 or array.shape != own.shape:
         raise ValueError(
             f"{name} must be float64 of shape {own.shape}, but is {np.asarray(value).dtype} of {array.shape}; use "
@@ -287,7 +287,10 @@ def _checked(name: str, value: npt.ArrayLike, own: FloatArray) -> FloatArray:
     if name == "outputs" and np.isinf(array).any():
         raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
     # Of beliefs `check_record` says what is too large.
-    if name not in ("records", "first") and (np.abs(array) > (most := SIZES[1] ** (1 + (name == "walk")))).any():
+    if (
+        name not in ("records", "first")
+        and (np.abs(array) > (most := MAGNITUDE_BOUNDS[1] ** (1 + (name == "walk")))).any()
+    ):
         worst = array.flat[np.nanargmax(np.abs(array))]
         raise ValueError(f"{name} must be within ±{most:g}, but has {worst:g}; use arrays() of an estimator")
     return array

@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.arrays import copy
-from estimator.checks import numbers
 from estimator.engine import cache as stored
 from estimator.engine.feeding import feeder, input_degree
 from estimator.engine.rows import input_rows
 from estimator.engine.tasks import NAMES
 from estimator.lanes import kernel, rows
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import FloatArray
 
 
 def free_run(
@@ -42,8 +42,8 @@ def free_run(
     Raises:
         ValueError: for shapes that do not fit, or what is no numbers.
     """
-    c, inputs = numbers("coefficients", coefficients), numbers("u", u)
-    start = np.zeros(model.n_states) if state is None else numbers("state", state)
+    c, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
+    start = np.zeros(model.n_states) if state is None else to_float_array("state", state)
     systems = {len(given) for given in (c, inputs, start) if given.ndim == 2}
     is_odd = len(systems) > 1 or any(given.ndim not in (1, 2) for given in (c, inputs, start))
     if is_odd or c.shape[-1] != model.n_coefficients or start.shape[-1] != model.n_states:

@@ -18,16 +18,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import LARGEST, number, numbers
 from estimator.engine.feeding import input_degree
 from estimator.engine.rows import path_results
 from estimator.engine.tasks import path
 from estimator.inputs import lengths_of
 from estimator.lanes import jit, kernel
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.physical import physical_slopes, to_physical
-from estimator.units import VOLTS, Scales
+from estimator.rigs.physical_parameters import physical_jacobian, to_physical
+from estimator.rigs.units import VOLT_SCALES, Scales
+from estimator.support.argument_checks import MAX_MAGNITUDE, check_number, to_float_array
+from estimator.support.array_types import FloatArray
 
 
 def fisher_information(
@@ -64,10 +64,10 @@ def fisher_information(
     Raises:
         ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
     """
-    degree = input_degree(Model.checked(model), interpolation)
+    degree = input_degree(Model.require_model(model), interpolation)
     noises = variances(model, process_noise, measurement_noise)
-    number("state_std", state_std, 0, LARGEST, "0 is at rest")
-    points, inputs = numbers("coefficients", coefficients), numbers("u", u)
+    check_number("state_std", state_std, 0, MAX_MAGNITUDE, "0 is at rest")
+    points, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
     if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
         raise ValueError(f"coefficients must be of {list(model.coefficients)}, but have shape {points.shape}")
     if inputs.ndim not in (1, 2):
@@ -102,12 +102,12 @@ def variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt
     Raises:
         ValueError: for one that is out of range, or a number of sensors that is not the model's.
     """
-    process = numbers("process_noise", process_noise)
+    process = to_float_array("process_noise", process_noise)
     if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
         raise ValueError(
             f"process_noise must be 0 or more and finite, but is {process_noise!r}; pass a standard deviation"
         )
-    stds = numbers("measurement_noise", measurement_noise)
+    stds = to_float_array("measurement_noise", measurement_noise)
     if stds.ndim > 2 or (stds.ndim and stds.shape[-1] != model.n_outputs):
         raise ValueError(
             f"measurement_noise must be one number, or one for each of {list(model.outputs)}, but has shape "
@@ -134,7 +134,7 @@ def outputs_of(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray
     Raises:
         ValueError: for another shape.
     """
-    outputs = numbers("y", y)
+    outputs = to_float_array("y", y)
     if model.n_outputs == 1 and outputs.shape == inputs.shape:
         outputs = outputs[..., None]
     if outputs.shape != (*inputs.shape, model.n_outputs):
@@ -164,8 +164,8 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
     Raises:
         ValueError: if Λ0 + F is not finite or not positive definite.
     """
-    total = numbers("information", information)
-    prior = np.zeros((1, 1)) if prior_precision is None else numbers("prior_precision", prior_precision)
+    total = to_float_array("information", information)
+    prior = np.zeros((1, 1)) if prior_precision is None else to_float_array("prior_precision", prior_precision)
     for name, matrix in (("information", total), ("prior_precision", prior)):
         if matrix.ndim < 2 or 0 in matrix.shape or matrix.shape[-2] != matrix.shape[-1]:
             raise ValueError(f"{name} must have shape (..., K, K), but has {matrix.shape}")
@@ -184,7 +184,7 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
 
 
 def relative_covariance(
-    model: Model, coefficients: npt.ArrayLike, covariance: npt.ArrayLike, scales: Scales = VOLTS
+    model: Model, coefficients: npt.ArrayLike, covariance: npt.ArrayLike, scales: Scales = VOLT_SCALES
 ) -> FloatArray:
     """Covariance of the relative errors of the physical parameters, to first order, from one of the coefficients.
 
@@ -200,14 +200,14 @@ def relative_covariance(
     Raises:
         ValueError: for something that is not a model, or shapes that do not fit it.
     """
-    points, spread = numbers("coefficients", coefficients), numbers("covariance", covariance)
-    k = Model.checked(model).n_coefficients
+    points, spread = to_float_array("coefficients", coefficients), to_float_array("covariance", covariance)
+    k = Model.require_model(model).n_coefficients
     if points.shape[-1:] != (k,) or spread.shape[-2:] != (k, k):
         raise ValueError(
             f"coefficients and covariance must have shapes (..., {k}) and (..., {k}, {k}) for {model.name}, but have "
             f"{points.shape} and {spread.shape}"
         )
-    slopes = physical_slopes(model, points, scales) / to_physical(model, points, scales)[..., :, None]
+    slopes = physical_jacobian(model, points, scales) / to_physical(model, points, scales)[..., :, None]
     relative: FloatArray = slopes @ spread @ np.swapaxes(slopes, -1, -2)
     return relative
 

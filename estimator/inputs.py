@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.rig import INTERPOLATIONS, Rig
+from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
+from estimator.support.array_types import FloatArray
 
 #: Inputs that the look-ahead interpolation passes through: the last nine, and the next.
 _WINDOW = 10
 
 #: Of the spline through the inputs: they have power up to two thirds of the Nyquist frequency.
-_DEGREE = INTERPOLATIONS["spline"]
+_DEGREE = INTERPOLATION_DEGREES["spline"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def feed(model: Model, rig: Rig) -> Feed:
     Raises:
         ValueError: for a delay in parts of a sample, or a lag, which only `identify` follows.
     """
-    delay = rig.whole_delay
+    delay = rig.integer_delay
     if not model.is_continuous:
         return _feed(np.eye(model.taps)[::-1], delay)
     if rig.interpolation == "zero_order":
@@ -91,7 +91,7 @@ def lengths_of(series: FloatArray) -> npt.NDArray[np.int64]:
 
 def degree(model: Model, rig: Rig) -> int:
     """Of the input's polynomial over a sample; 0 for a difference equation."""
-    return INTERPOLATIONS[rig.interpolation] if model.is_continuous else 0
+    return INTERPOLATION_DEGREES[rig.interpolation] if model.is_continuous else 0
 
 
 def _feed(stencil: FloatArray, lag: int, fills: bool = False) -> Feed:

@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.checks import numbers
 from estimator.engine.feeding import input_degree
 from estimator.information import follow, outputs_of, sampled, variances
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import FloatArray
 
 #: Steps at most, and the step at which the search ends, in standard deviations of the posterior.
 _STEPS, _SMALL = 60, 1e-6
@@ -78,7 +78,7 @@ def maximum_a_posteriori(
     Raises:
         ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
     """
-    inputs = numbers("u", u)
+    inputs = to_float_array("u", u)
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_of(model, inputs, y))
@@ -104,7 +104,7 @@ def maximum_a_posteriori(
         curvature = found.information[:, free[:, None], free] * np.outer(scale, scale) + precision
         return loss, scale * found.slope[:, free] + pull, curvature
 
-    begins = [numbers(f"starts[{i}]", start) for i, start in enumerate(starts)]
+    begins = [to_float_array(f"starts[{i}]", start) for i, start in enumerate(starts)]
     for i, begin in enumerate(begins):
         if begin.shape != (len(inputs), len(center)):
             raise ValueError(

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import series, whole
 from estimator.lanes import kernel
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import check_integer, to_finite_series
+from estimator.support.array_types import FloatArray
 
 TOLERANCE = 1e-6
 """A fit has converged where a step lowers the cost by less than this fraction. On the Silverbox record the whole gain
@@ -80,8 +80,8 @@ class PEMNARX:
 
     def __post_init__(self) -> None:
         for name, least in (("units", 0), ("seed", 0), ("restarts", 1)):
-            whole(name, getattr(self, name), 10**9 if name == "seed" else 1000, least)
-        whole("input_delay (the published run had 0)", self.input_delay, 1, 0)
+            check_integer(name, getattr(self, name), 10**9 if name == "seed" else 1000, least)
+        check_integer("input_delay (the published run had 0)", self.input_delay, 1, 0)
 
     def fit(self, u: npt.ArrayLike, y: npt.ArrayLike) -> PEMNARX:
         """Fits the network to one record, and gives this model. An earlier fit is replaced.
@@ -168,7 +168,7 @@ class PEMNARX:
             RuntimeError: Before `fit`.
         """
         parameters, mean = self._fitted()
-        u, y_init = series("u", u), series("y_init", y_init)
+        u, y_init = to_finite_series("u", u), to_finite_series("y_init", y_init)
         if not 2 <= len(y_init) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(y_init)}")
         simulated = np.empty(len(u))
@@ -251,7 +251,7 @@ def _free_run(parameters, regressor_mean, u, input_delay, y, start):
 
 def _pair(u: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Two finite series of one length of at least 2."""
-    inputs, outputs = series("u", u), series("y", y)
+    inputs, outputs = to_finite_series("u", u), to_finite_series("y", y)
     if inputs.shape != outputs.shape or len(outputs) < 2:
         raise ValueError(
             f"u and y must have one length of at least 2, but have {len(inputs)} and {len(outputs)}; cut the longer one"

@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.checks import scalar, series
 from estimator.ensemble import Hypotheses, NoiseRatio
 from estimator.filter import Filter
 from estimator.inference import DEFAULT_ITERATIONS
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
 from estimator.priors import recorded_prior, silverbox_prior
-from estimator.progress import progress as shown
-from estimator.rig import Channel, Rig
-from estimator.rig_prior import rig_prior
+from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.rig_prior import rig_prior
 from estimator.settings import Settings, settled
+from estimator.support.argument_checks import to_finite_series, to_scalar
+from estimator.support.array_types import FloatArray
+from estimator.support.progress import show_progress as shown
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
 
@@ -171,11 +171,14 @@ class OnlineEstimator:
         if self._filter.feed.at_once:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
         if self.model.n_outputs > 1:
-            self.run(np.array([scalar("u", u)]), np.reshape(series("y", y), (1, -1)))
+            self.run(np.array([to_scalar("u", u)]), np.reshape(to_finite_series("y", y), (1, -1)))
             return
         # What is two finite floats needs no further look: this is the inner loop of who takes samples one by one.
         if not (isinstance(u, float) and isinstance(y, float) and math.isfinite(u + y)):
-            u, y = float(series("u", [scalar("u", u)])[0]), float(series("y", [scalar("y", y)])[0])
+            u, y = (
+                float(to_finite_series("u", [to_scalar("u", u)])[0]),
+                float(to_finite_series("y", [to_scalar("y", y)])[0]),
+            )
         u, y = u / self.scales.input, y / self.scales.output
         used = not self._filter.is_waiting
         free_energies, forecasts = self._spare
@@ -283,7 +286,7 @@ class OnlineEstimator:
         Returns:
             Simulated outputs (T,) or (T, sensors); inf or NaN from where the model diverges.
         """
-        u = series("u", u) / self.scales.input
+        u = to_finite_series("u", u) / self.scales.input
         outputs = self._outputs("y_init", y_init, False)
         if not 2 <= len(outputs) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(outputs)}")
@@ -293,7 +296,7 @@ class OnlineEstimator:
         self, u: npt.ArrayLike, y: npt.ArrayLike, missing: bool, least: int = 0
     ) -> tuple[FloatArray, FloatArray]:
         """Inputs (T,) and outputs (T, sensors), checked."""
-        inputs, outputs = series("u", u), self._outputs("y", y, missing)
+        inputs, outputs = to_finite_series("u", u), self._outputs("y", y, missing)
         if len(inputs) != len(outputs) or len(inputs) < least:
             wish = f" of at least {least}" if least else ""
             raise ValueError(
@@ -304,12 +307,12 @@ class OnlineEstimator:
     def _outputs(self, name: str, y: npt.ArrayLike, missing: bool) -> FloatArray:
         sensors = self.model.n_outputs
         if sensors == 1:
-            return series(name, y, missing)[:, None] / self.scales.output
+            return to_finite_series(name, y, missing)[:, None] / self.scales.output
         shape = np.shape(y)
         if len(shape) != 2 or shape[1] != sensors:
             raise ValueError(f"{name} must have shape (T, {sensors}), a column for each sensor, but has {shape}")
         flat = np.ma.reshape(y, -1) if isinstance(y, np.ma.MaskedArray) else np.reshape(y, -1)
-        return series(name, flat, missing).reshape(shape) / self.scales.output
+        return to_finite_series(name, flat, missing).reshape(shape) / self.scales.output
 
     def _shown(self, told: FloatArray, *scales: float) -> FloatArray:
         """What the filter tells (T, sensors, ...), in the rig's units; (T, ...) of one sensor."""

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.checks import numbers
 from estimator.engine import tasks
 from estimator.engine.rows import belief_names
 from estimator.inference import DEFAULT_ITERATIONS, mean_field
 from estimator.inputs import degree, feed, lengths_of
 from estimator.lanes import LANES, kernel
 from estimator.models.model import Model
-from estimator.rig import Rig
+from estimator.rigs.rig import Rig
+from estimator.support.argument_checks import to_float_array
 
 
 def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:
@@ -43,7 +43,7 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     """
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
-    inputs, outputs = numbers("u", u), numbers("y", y)
+    inputs, outputs = to_float_array("u", u), to_float_array("y", y)
     sensors = prior.model.n_outputs
     if sensors == 1 and outputs.shape == inputs.shape:
         outputs = outputs[..., None]

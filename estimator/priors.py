@@ -9,13 +9,20 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.checks import flag, is_finite, mapping, number, numbers, shown
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
-from estimator.parameters import CONTINUOUS_TWIN, SILVERBOX_TWIN, FloatArray
-from estimator.physical import coefficients_of
-from estimator.units import VOLTS, Scales
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.units import VOLT_SCALES, Scales
+from estimator.support.argument_checks import (
+    check_bool,
+    check_mapping,
+    check_number,
+    is_finite_number,
+    short_repr,
+    to_float_array,
+)
+from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN, FloatArray
 
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.
@@ -26,7 +33,7 @@ _STDS = 1e-60, 1e60
 
 
 def log_uniform_moments(
-    model: Model, center: Mapping[str, float], spread: float, scales: Scales = VOLTS
+    model: Model, center: Mapping[str, float], spread: float, scales: Scales = VOLT_SCALES
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the coefficients of a plant known only up to a factor.
 
@@ -45,12 +52,12 @@ def log_uniform_moments(
     Raises:
         ValueError: for a spread out of range, or a center that is 0, missing or not finite.
     """
-    names = list(Model.checked(model).physical or model.coefficients)
-    mapping("center", center)
-    number("spread", spread, 0, 1 - 1e-9, "log-uniform intervals do not reach 0")
+    names = list(Model.require_model(model).physical or model.coefficients)
+    check_mapping("center", center)
+    check_number("spread", spread, 0, 1 - 1e-9, "log-uniform intervals do not reach 0")
     for name in names:
-        if name not in center or not is_finite(center[name]) or center[name] == 0:
-            raise ValueError(f"center must have a finite {name} other than 0, but is {shown(center)}")
+        if name not in center or not is_finite_number(center[name]) or center[name] == 0:
+            raise ValueError(f"center must have a finite {name} other than 0, but is {short_repr(center)}")
     mean, cov = _log_uniform_moments(model, tuple(float(center[name]) for name in names), float(spread), scales)
     return mean.copy(), cov.copy()
 
@@ -71,7 +78,7 @@ def _log_uniform_moments(
 
 
 def gaussian_moments(
-    model: Model, mean: Mapping[str, float], std: Mapping[str, float], scales: Scales = VOLTS
+    model: Model, mean: Mapping[str, float], std: Mapping[str, float], scales: Scales = VOLT_SCALES
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the coefficients of a plant whose parameters are independent and Gaussian.
 
@@ -86,11 +93,11 @@ def gaussian_moments(
     Returns:
         Mean (K,) and covariance (K, K).
     """
-    names = list(Model.checked(model).physical or model.coefficients)
+    names = list(Model.require_model(model).physical or model.coefficients)
     for name, given in (("mean", mean), ("std", std)):
-        mapping(name, given)
+        check_mapping(name, given)
         for parameter in names if name == "mean" else given:
-            number(f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STDS[1], _STDS[1])
+            check_number(f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STDS[1], _STDS[1])
     nodes = max(2, min(7, int(_POINTS ** (1 / len(names)))))
     return moments(model, {name: gaussian(mean[name], std.get(name, 0.0), nodes) for name in names}, scales)
 
@@ -132,7 +139,7 @@ def weak_prior(
     measurement_noise: float | Sequence[float] = 5e-4,
     noise_shape: float = 2.0,
     state_std: float | Sequence[float] = 1e-3,
-    scales: Scales = VOLTS,
+    scales: Scales = VOLT_SCALES,
 ) -> Belief:
     """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
 
@@ -150,17 +157,17 @@ def weak_prior(
     Raises:
         ValueError: for a value out of its range, or as `Belief`.
     """
-    Model.checked(model)
-    number("process_noise", process_noise, *_STDS)
-    number("noise_shape", noise_shape, *_STDS)
+    Model.require_model(model)
+    check_number("process_noise", process_noise, *_STDS)
+    check_number("noise_shape", noise_shape, *_STDS)
     n, k = model.n_states, model.n_coefficients
     for name, value, size in (("measurement_noise", measurement_noise, model.n_outputs), ("state_std", state_std, n)):
         for one in np.ravel(np.asarray(value, dtype=object)):
-            number(name, one, *_STDS)
+            check_number(name, one, *_STDS)
         if np.shape(value) not in ((), (size,)):
             raise ValueError(f"{name} must be one number or {size}, but has shape {np.shape(value)}")
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
-    given = numbers("mean", mean), numbers("cov", cov)
+    given = to_float_array("mean", mean), to_float_array("cov", cov)
     if given[0].shape != (k,) or given[1].shape != (k, k):
         raise ValueError(f"mean and cov must have shapes {(k,)} and {(k, k)}, but have {[one.shape for one in given]}")
     joint_mean[n:], joint[n:, n:] = given
@@ -171,7 +178,7 @@ def weak_prior(
 
 
 #: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.plants.silverbox_twin`` identifies them).
-_TWINS = {"difference": SILVERBOX_TWIN, "duffing": CONTINUOUS_TWIN}
+_TWINS = {"difference": SILVERBOX_TWIN, "duffing": SILVERBOX_ODE_TWIN}
 
 
 def silverbox_prior(
@@ -195,10 +202,10 @@ def silverbox_prior(
     Raises:
         ValueError: for a model with other parameters, or a value out of its range.
     """
-    model = difference() if model is None else Model.checked(model)
+    model = difference() if model is None else Model.require_model(model)
     if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
-    number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
+    check_number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
     moments = log_uniform_moments(model, _TWINS[model.name], spread)
     return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, state_std)
 
@@ -225,8 +232,8 @@ def _paper_prior(
     nonlinear: bool, model: Model | None, eta: tuple[float, float], gamma: tuple[float, float], xi: tuple[float, float]
 ) -> Belief:
     """Means of 1 (of the states 0) and variances of 10, but for η."""
-    model = difference() if model is None else Model.checked(model)
-    flag("nonlinear", nonlinear)
+    model = difference() if model is None else Model.require_model(model)
+    check_bool("nonlinear", nonlinear)
     mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
     mean[: model.n_states], (mean[-1], variance[-1]) = 0.0, eta
     if not nonlinear:
@@ -245,7 +252,7 @@ def recorded_prior(
     """A weak prior about the Silverbox twin, for recorded data that begin in motion: 0.1 V in every state.
 
     Args:
-        model: `estimator.models.duffing.duffing` with any terms, or `estimator.models.difference.difference`.
+        model: `estimator.models.duffing.duffing` with any terms, or `estimator.models.difference_equation.difference`.
         spread: relative standard deviation of stiffness, cubic, damping and gain; the offsets are 0 with one of 20 mV,
             feedthrough and cubic damping (per sample) 0 with one of 0.1. Of a difference equation: standard deviation
             of the coefficients of lags and inputs, which are centred on those of Eq. (2) where that has them; those of
@@ -257,8 +264,8 @@ def recorded_prior(
     Raises:
         ValueError: for another model, or a value out of its range.
     """
-    number("spread", spread, 0)
-    if Model.checked(model).name not in _TWINS:
+    check_number("spread", spread, 0)
+    if Model.require_model(model).name not in _TWINS:
         raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
     moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
     prior = weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, 0.1)

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from estimator.belief import Belief, record_size
-from estimator.checks import shown
-from estimator.files import file_name, whole_file, write_atomically
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
-from estimator.rig import Rig
-from estimator.units import Scales
+from estimator.rigs.rig import Rig
+from estimator.rigs.units import Scales
+from estimator.support.argument_checks import short_repr
+from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
 #: Raised when the content of the files changes.
 FORMAT = 3
@@ -35,8 +35,8 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
         ValueError: for what is not an estimator, or no name of a file.
     """
     if not isinstance(estimator, OnlineEstimator):
-        raise ValueError(f"estimator must be an OnlineEstimator, but is {shown(estimator)}")
-    place = file_name("path", path)
+        raise ValueError(f"estimator must be an OnlineEstimator, but is {short_repr(estimator)}")
+    place = to_path("path", path)
     if place.is_dir():
         raise ValueError(f"path must be the name of a file, but {place} is a folder; name a file in it")
     description = {
@@ -59,7 +59,7 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
         FileNotFoundError: if there is no such file.
     """
-    place = whole_file(path, "path must be a file of save_estimator, identify --save or a run", _LARGEST)
+    place = check_readable_file(path, "path must be a file of save_estimator, identify --save or a run", _LARGEST)
     try:
         return _built(_read(place))
     except Exception as error:  # whatever the readers make of a foreign file

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from estimator.checks import flag, number, one_of, whole
 from estimator.ensemble import Hypotheses
 from estimator.inference import DEFAULT_ITERATIONS, EXPECTATIONS, MOST_ITERATIONS
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
+from estimator.support.argument_checks import check_bool, check_choice, check_integer, check_number
 
 #: More ratios of the noises than data could tell apart; and of two numbers, more values of each than there are noises.
 _MOST_HYPOTHESES, _MOST_VALUES = 1000, 99
@@ -34,21 +34,21 @@ def settled(model: Model, given: Settings) -> Settings:
     Raises:
         ValueError: naming the option, the value and the remedy.
     """
-    one_of("factorisation", given.factorisation, DEFAULT_ITERATIONS)
-    flag("as_published", given.as_published)
+    check_choice("factorisation", given.factorisation, DEFAULT_ITERATIONS)
+    check_bool("as_published", given.as_published)
     published = given.factorisation == "mean_field"
     if published and model != difference():
         raise ValueError(
             f"factorisation must be 'structured' for {model.name}, but is 'mean_field'; that is for the paper's model"
         )
-    whole("iterations", given.iterations, MOST_ITERATIONS)
+    check_integer("iterations", given.iterations, MOST_ITERATIONS)
     if given.as_published and not published:
         raise ValueError(
             f"as_published goes with factorisation='mean_field', but factorisation is {given.factorisation!r}; the "
             f"published run was mean field"
         )
-    one_of("expectations", given.expectations, EXPECTATIONS[:1] if published else EXPECTATIONS)
-    number("drift", given.drift, 0, 1, "0 is a system that stays, and of one that walks faster nothing is known")
+    check_choice("expectations", given.expectations, EXPECTATIONS[:1] if published else EXPECTATIONS)
+    check_number("drift", given.drift, 0, 1, "0 is a system that stays, and of one that walks faster nothing is known")
     if given.drift and published:
         raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {given.drift!r}; use structured")
     return replace(
@@ -70,7 +70,7 @@ def checked_hypotheses(given: object, factorisation: str, model: Model, most: in
         raise ValueError(f"noise_hypotheses must be a number, or two such as (5, 5), but is {given!r:.60}")
     counts: list[Any] = list(given) if isinstance(given, tuple | list) else [given]
     for count in counts:
-        whole("noise_hypotheses", count, min(most, _MOST_VALUES) if len(counts) == 2 else most)
+        check_integer("noise_hypotheses", count, min(most, _MOST_VALUES) if len(counts) == 2 else most)
     if math.prod(counts) > most:
         raise ValueError(f"noise_hypotheses must be at most {most} in all, but are {given}; (9, 9) are plenty")
     published = factorisation == "mean_field"

@@ -106,7 +106,7 @@ def answered(made: Made, folder: Path) -> Iterator[tuple[str, Result]]:
     while rig is not None:
         result = identify(rig, paths)
         truth = dict(zip("mcab", made.truth, strict=True))
-        if result.is_free:
+        if result.is_free_decay:
             truth = {f"{name}/m": truth[name] / truth["m"] for name in "cab"}
         off = [abs(result.parameters[p][0] - value) / result.parameters[p][1] for p, value in truth.items()]
         yield "right" if np.nanmax(off) <= 4.0 else "named" if result.warnings else "silent", result

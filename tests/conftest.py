@@ -61,8 +61,8 @@ def modules_of_the_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
 
 @pytest.fixture(autouse=True)
 def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether work takes longer than `estimator.progress.EVERY` is for the machine to say."""
-    monkeypatch.setattr("estimator.progress.EVERY", float("inf"))
+    """Whether work takes longer than `estimator.support.progress.REPORT_INTERVAL` is for the machine to say."""
+    monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", float("inf"))
 
 
 #: Files whose kernels others compile, which begin when these are done.

@@ -21,11 +21,11 @@ from duffing_env.tracks.rig_env import RigEnv, RigVectorEnv
 from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv, SilverboxReplayVectorEnv
 from estimator import Channel, Rig
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
-from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 # --- Models --------------------------------------------------------------------------------------------------------
 
@@ -38,7 +38,7 @@ RIG = Rig(
     guess={"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
 )  # fmt: skip
 #: In volts, as the tracks are, so that the same numbers go into the same estimator.
-VOLTS = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+VOLTS = Rig(SILVERBOX_SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
 
 MODELS = {
     "difference": difference(),

@@ -105,11 +105,15 @@ def test_numbers_that_are_near_enough(want, got, near):
 
 
 def test_every_check_is_explained():
-    from estimator.identification import checks, guesses
+    from estimator.identification.diagnostics import guess_checks, validity_checks
 
-    source = "".join(Path(module.__file__).read_text() for module in (checks, guesses))
-    names = set(re.findall(r'Finding\("(\w+)"', source)) | set(checks._TERMS) | {"delay", "interpolation"}
-    names |= {slip.check for slip in (*guesses._SLIPS, *guesses._OF_STEP.values())}
+    source = "".join(Path(module.__file__).read_text() for module in (validity_checks, guess_checks))
+    names = (
+        set(re.findall(r'Finding\("(\w+)"', source))
+        | set(validity_checks._TERM_DESCRIPTIONS)
+        | {"delay", "interpolation"}
+    )
+    names |= {slip.check_name for slip in (*guess_checks._CALIBRATION_ERRORS, *guess_checks._STEP_ERRORS.values())}
     assert len(names) > 10
     explained = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "checks.md").read_text(), re.MULTILINE)
     assert set(explained) == names

@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from tables import table
 
-from estimator.extras import EXTRAS
+from estimator.support.optional_dependencies import EXTRA_OF_PACKAGE
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -153,6 +153,6 @@ def test_another_numba_is_refused_by_name(package):
 
 
 def test_extras_are_those_that_are_named_where_a_package_is_missing():
-    for package, extra in EXTRAS.items():
+    for package, extra in EXTRA_OF_PACKAGE.items():
         lines = SETTINGS["project"]["optional-dependencies"][extra]
         assert any(line.startswith(package.replace("_", "-")) for line in lines), package

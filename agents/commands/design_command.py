@@ -42,9 +42,9 @@ class DesignCommand:
         from agents.cli import check_distinct_files, check_not_overwritten
         from agents.console_output import print_wrapped
         from agents.hardware.next_experiment import design_experiment
-        from estimator.extras import need
-        from estimator.progress import progress
         from estimator.saving import load_estimator
+        from estimator.support.optional_dependencies import require_packages
+        from estimator.support.progress import show_progress
 
         check_distinct_files(
             {"output": self.output, "figure": self.figure}, [self.rig, *filter(None, [self.posterior])]
@@ -52,11 +52,11 @@ class DesignCommand:
         check_not_overwritten("output", self.output, self.force)
         check_not_overwritten("figure", self.figure, self.force)
         if self.figure is not None:
-            need("matplotlib")
+            require_packages("matplotlib")
             if self.figure.suffix.lower() != ".png":
                 raise ValueError(f"figure must be a PNG file, but is {self.figure}; let its name end in .png")
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
-        with progress("Designing") as on_progress:
+        with show_progress("Designing") as on_progress:
             experiment_design = design_experiment(
                 self.rig, prior, self.policy, self.samples, self.bound, self.seed, on_progress
             )
@@ -81,8 +81,8 @@ def print_experiment_design(experiment_design: Any) -> None:
     from agents.console_output import format_table, print_warning
     from agents.console_output import print_texts_and_tables as print_all
     from agents.hardware.next_experiment import undersampling_message
-    from estimator.identification.checks import SLOWEST
-    from estimator.units import digits_of
+    from estimator.identification.diagnostics.validity_checks import MIN_SAMPLES_PER_PERIOD
+    from estimator.rigs.units import digits_to_distinguish
 
     # A mean that differs from 0 by rounding alone is 0.
     rows = [
@@ -95,7 +95,7 @@ def print_experiment_design(experiment_design: Any) -> None:
             unit,
         ]
         for name, mean, (low, high), half_width, unit in experiment_design.parameter_rows()
-        for digits in [digits_of(low, high, 5)]
+        for digits in [digits_to_distinguish(low, high, 5)]
     ]
     description = f"{len(experiment_design.u)} samples by {experiment_design.policy}, up to {abs(experiment_design.u).max():.3g} {experiment_design.rig.input.unit}"
     description += f", made smaller to {experiment_design.share:.2g} of it" if experiment_design.share < 1 else ""
@@ -106,5 +106,5 @@ def print_experiment_design(experiment_design: Any) -> None:
     if len(set(experiment_design.u.tolist())) == 1 and experiment_design.share > 0:
         message = f"every input is the same: {experiment_design.policy} holds its values for longer than {len(experiment_design.u)} samples here"
         print_warning(f"{message}; choose another signal, or more samples")
-    if experiment_design.samples_per_period < SLOWEST:
+    if experiment_design.samples_per_period < MIN_SAMPLES_PER_PERIOD:
         print_warning(undersampling_message(experiment_design.rig.step, experiment_design.samples_per_period))

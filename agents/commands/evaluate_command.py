@@ -95,13 +95,13 @@ class EvaluateCommand:
             entry_cells,
         )
         from agents.leaderboard.protocol import measure_policy
-        from estimator.progress import progress
+        from estimator.support.progress import show_progress
 
         (policy,) = self.policies
         track = full_track_id(protocol)
         self._check_protocol(track)
         tracks_with_name = set() if self.submit is None else check_new_entry(self.board, self.submit)
-        with progress("Measuring") as on_progress:
+        with show_progress("Measuring") as on_progress:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure_policy(policy, track, name, self.samples, on_progress)
         # What is printed needs no file, and comes also where none can be written.

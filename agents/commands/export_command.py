@@ -42,7 +42,7 @@ class ExportCommand:
         from agents.cli import check_not_overwritten
         from agents.console_output import print_wrapped
         from agents.policies.signal_export import export_signal
-        from estimator.parameters import SAMPLING_STEP
+        from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
         check_not_overwritten("output", self.output, self.force)
         if self.output.suffix == ".onnx":
@@ -51,7 +51,7 @@ class ExportCommand:
         limits = {name: value for name, value in vars(self).items() if name not in ("name", "output", "force")}
         volts = export_signal(self.name, self.output, **limits)
         peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
-        seconds = volts.size * SAMPLING_STEP
+        seconds = volts.size * SILVERBOX_SAMPLING_STEP
         print_wrapped(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")
 
     def _export_network(self) -> None:

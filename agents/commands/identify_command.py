@@ -85,7 +85,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
                 "samples": len(record.u),
                 "step": record.step or result.rig.step,
                 "missing": record.missing,
-                "clipped": record.clipped,
+                "clipped": record.n_clipped,
             }
             for record in result.records
         ],
@@ -126,14 +126,14 @@ def print_identification(result: Result) -> None:
 
     from agents.console_output import format_table, rich_console
     from agents.console_output import print_texts_and_tables as print_all
-    from estimator.checks import printable
-    from estimator.units import digits_of
+    from estimator.rigs.units import digits_to_distinguish
+    from estimator.support.argument_checks import mask_control_codes
 
     units, intervals, rows = result.units, result.interval(0.9), []
     for name, (mean, _) in result.parameters.items():
         low, high = intervals[name]
-        digits = digits_of(low, high, 5)
-        value = "open" if name in result.open else f"{mean:.{digits}g}"
+        digits = digits_to_distinguish(low, high, 5)
+        value = "open" if name in result.unidentified else f"{mean:.{digits}g}"
         rows.append([name, value, f"{low:.{digits}g} to {high:.{digits}g}", units[name]])
     print_all(
         *sampling_step_sentences(result),
@@ -141,6 +141,6 @@ def print_identification(result: Result) -> None:
         format_table(("", "mean", "90 % interval", "unit"), rows),
     )
     for warning in result.warnings:
-        rich_console().print(Text.assemble((warning.name, "bold red"), f": {printable(warning.message)}"))
+        rich_console().print(Text.assemble((warning.name, "bold red"), f": {mask_control_codes(warning.message)}"))
     if not result.warnings:
         rich_console().print("No check speaks against this result.", style="green")

@@ -38,27 +38,27 @@ class RigInitCommand:
     def run(self) -> None:
         """Write it."""
         from agents.cli import check_not_overwritten
-        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, text_of
+        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, to_toml
         from agents.console_output import print_wrapped
-        from estimator.files import write_atomically
-        from estimator.rig import SHIPPED
+        from estimator.rigs.rig import SHIPPED_RIGS
+        from estimator.support.file_io import write_atomically
 
         check_not_overwritten("path", self.path, self.force)
         for name in ("step", "input", "output"):
-            if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED):
+            if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED_RIGS):
                 raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")
         summary = ""
         if self.source is None:
-            text = text_of(ask_for_rig())
-        elif self.source in SHIPPED:
-            text = SHIPPED[self.source].read_text(encoding="utf-8")
+            text = to_toml(ask_for_rig())
+        elif self.source in SHIPPED_RIGS:
+            text = SHIPPED_RIGS[self.source].read_text(encoding="utf-8")
         else:
             text, summary = rig_text_from_record(Path(self.source), self.step, self.input, self.output)
         write_atomically(self.path, text)
         if summary:
             print_wrapped(summary)
         print_wrapped(f"Wrote {self.path}: read it, and correct what is not so.")
-        data = "data.csv" if self.source is None or self.source in SHIPPED else self.source
+        data = "data.csv" if self.source is None or self.source in SHIPPED_RIGS else self.source
         print_wrapped(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
 
 
@@ -71,10 +71,10 @@ class RigListCommand:
 
     def run(self) -> None:
         """Print them."""
-        from estimator.rig import SHIPPED
+        from estimator.rigs.rig import SHIPPED_RIGS
 
-        width = max(map(len, SHIPPED))
-        for name, path in SHIPPED.items():
+        width = max(map(len, SHIPPED_RIGS))
+        for name, path in SHIPPED_RIGS.items():
             first = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
             description = first.split(". See")[0].rstrip(".")
             print(

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from estimator.checks import printable
-from estimator.identification.records import read
-from estimator.identification.tables import read_table
-from estimator.models.duffing import KINDS
-from estimator.rig import INTERPOLATIONS, Channel, Rig
-from estimator.rig_text import text_of
-from estimator.units import coherent, conversion
+from estimator.identification.data.record_reader import read_record_file
+from estimator.identification.data.text_tables import read_table
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
+from estimator.rigs.rig import INTERPOLATION_DEGREES, Channel, Rig
+from estimator.rigs.rig_toml import to_toml
+from estimator.rigs.units import conversion_factor, to_si_unit
+from estimator.support.argument_checks import mask_control_codes
 
 _NOT_KNOWN = "not known"
 
@@ -46,8 +46,8 @@ def rig_text_from_record(
         if step is None:
             raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
         rig = Rig(step, input=Channel(column=input_column), output=Channel(column=output_column))
-        read(path, rig)
-        return text_of(rig, f", from {printable(path.name)}"), _sampling_step_sentence(step, "--step")
+        read_record_file(path, rig)
+        return to_toml(rig, f", from {mask_control_codes(path.name)}"), _sampling_step_sentence(step, "--step")
     table = read_table(path, input_column, output_column)
     step_of_times = table.step()
     if step is None and step_of_times is None:
@@ -68,20 +68,20 @@ def rig_text_from_record(
     input_unit, output_unit = (None if place is None else table.unit(place) for place in (table.u, table.y))
     # A name that says nothing was taken by its place, and stands in the file to be seen.
     column_names = [
-        None if place is None or table.is_known(place) else table.names[place] for place in (table.u, table.y)
+        None if place is None or table.has_known_name(place) else table.names[place] for place in (table.u, table.y)
     ]
     # A g of an input may be one of weight.
     si_units = [
-        one if one in (None, "g") and k == 0 else coherent(one or "1")[1]
+        one if one in (None, "g") and k == 0 else to_si_unit(one or "1")[1]
         for k, one in enumerate((input_unit, output_unit))
     ]
     output = Channel(si_units[1] or "1", kind=table.kind() or "displacement", column=output_column or column_names[1])
     rig = Rig(step, input=Channel(si_units[0] or "1", column=input_column or column_names[0]), output=output)
     for name, one, base in zip(("input", "output"), (input_unit, output_unit), si_units, strict=True):
-        if one and base and conversion(one, base) != 1.0:
+        if one and base and conversion_factor(one, base) != 1.0:
             sentences.append(f"The {name} is in {one}, and is taken in {base}: results are in units of SI.")
     note = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
-    return text_of(rig, f", from {printable(path.name)}{note}"), "\n".join(sentences)
+    return to_toml(rig, f", from {mask_control_codes(path.name)}{note}"), "\n".join(sentences)
 
 
 def _sampling_step_sentence(step: float, source: str) -> str:
@@ -99,13 +99,21 @@ def ask_for_rig() -> Rig:
     try:
         step = _ask_until_valid("Sampling step in seconds, or rate such as 1000 Hz", None, _parse_sampling_step)
         interpolation = _ask_until_valid(
-            f"Input between samples: {', '.join(INTERPOLATIONS)}", "zero_order", _parse_choice(INTERPOLATIONS)
+            f"Input between samples: {', '.join(INTERPOLATION_DEGREES)}",
+            "zero_order",
+            _parse_choice(INTERPOLATION_DEGREES),
         )
         input_channel = Channel(_ask_until_valid("Unit of the input", "N", lambda words: Channel(words).unit))
         limit = _ask_until_valid("Largest input, in either direction", _NOT_KNOWN, _parse_positive)
-        kind = _ask_until_valid(f"Output: {', '.join(KINDS)}", "displacement", _parse_choice(KINDS))
+        kind = _ask_until_valid(
+            f"Output: {', '.join(DERIVATIVE_ORDER_OF_SENSOR)}",
+            "displacement",
+            _parse_choice(DERIVATIVE_ORDER_OF_SENSOR),
+        )
         unit = _ask_until_valid(
-            "Unit of the output", ("m", "m/s", "m/s²")[KINDS[kind]], lambda words: Channel(words).unit
+            "Unit of the output",
+            ("m", "m/s", "m/s²")[DERIVATIVE_ORDER_OF_SENSOR[kind]],
+            lambda words: Channel(words).unit,
         )
         output_range = _ask_until_valid("Largest output before an experiment must stop", _NOT_KNOWN, _parse_positive)
         rig = Rig(

@@ -42,14 +42,14 @@ class RunCommand:
         from agents.hardware.experiment_run import run_experiment
         from agents.hardware.plant_interface import load_plant
         from estimator import Rig
-        from estimator.progress import progress
         from estimator.saving import load_estimator
+        from estimator.support.progress import show_progress
 
-        rig, instrument = Rig.with_instrument(self.rig)
+        rig, instrument = Rig.read_with_instrument(self.rig)
         prior = None if self.posterior is None else load_estimator(self.posterior).belief
         plant = load_plant(self.plant, rig, instrument)
         try:
-            with progress("Running") as on_progress:
+            with show_progress("Running") as on_progress:
                 report_samples = lambda samples_done: on_progress(samples_done / self.plan.samples, self.plan.policy)  # noqa: E731
                 result = run_experiment(rig, plant, self.out, self.plan, prior=prior, on_progress=report_samples)
         finally:

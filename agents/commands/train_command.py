@@ -14,7 +14,7 @@ from agents.interruption import add_resume_hint
 from agents.training import ALGORITHMS, TrainConfig, TrainingSubject, resume, train, train_seeds, tune_hyperparameters
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.training_run import LEARNING_CURVE_FILE, UNTRAINED_FOLDER
-from estimator.checks import whole
+from estimator.support.argument_checks import check_integer
 
 TRAIN_HELP = """Train a policy that chooses the input, and compare it with the reference policies.
 
@@ -54,8 +54,8 @@ class TrainCommand(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole("tune", self.tune, 10**6, 0)
-        whole("seeds", self.seeds, 1000)
+        check_integer("tune", self.tune, 10**6, 0)
+        check_integer("seeds", self.seeds, 1000)
         if self.seeds > 1 and self.tune:
             raise ValueError(f"seeds must be 1 in a search, but is {self.seeds}; leave it out, or tune")
         if self.ray and self.seeds == 1 and not self.tune:

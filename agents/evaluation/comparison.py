@@ -20,8 +20,8 @@ from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import load_policy
 from agents.user_code import env_spec_of
 from duffing_env.plants.silverbox_record import record_available
-from estimator.extras import how_to_get, is_missing, need
-from estimator.progress import progress
+from estimator.support.optional_dependencies import install_hint, is_not_installed, require_packages
+from estimator.support.progress import show_progress
 
 #: What every input has to beat.
 BASELINE_SIGNALS = ("prbs", "uniform")
@@ -73,10 +73,10 @@ def compare_policies(
         OSError: where the folder is a file, or nothing can be written there, before a policy plays.
     """
     if as_report:
-        need("matplotlib")
+        require_packages("matplotlib")
     check_output_folder("report" if as_report else "output", folder)
     check_output_file("evaluation.json", folder / "evaluation.json")
-    with progress("Evaluating") as on_progress:
+    with show_progress("Evaluating") as on_progress:
         evaluations = evaluate_policies(policies, env_id, n_systems, seed, options, on_progress=on_progress)
     title = f"{env_id}, {n_systems} systems"
     settings = {"env": env_id, "systems": n_systems, "seed": seed, "options": options}
@@ -87,7 +87,7 @@ def compare_policies(
 
         write_html_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
         written += ["report.html"]
-    elif not is_missing("matplotlib"):
+    elif not is_not_installed("matplotlib"):
         from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
 
         save_png(plot_posterior_contraction(evaluations, title), folder / "contraction.png")
@@ -103,7 +103,7 @@ def compare_policies(
             "What is measured by the Silverbox record is left out: the Silverbox record is not on this machine."
         )
     if len(written) == 1:
-        print_wrapped(f"Figures are left out: {how_to_get('matplotlib')}")
+        print_wrapped(f"Figures are left out: {install_hint('matplotlib')}")
     for name in written:
         print_wrapped(str(folder / name))
     return evaluations

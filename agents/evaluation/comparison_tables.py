@@ -13,8 +13,8 @@ from scipy import stats
 
 from agents.console_output import format_table, print_texts_and_tables, split_to_width, write_json
 from agents.evaluation.policy_evaluation import Evaluation
-from estimator.parameters import FloatArray
-from estimator.units import labelled
+from estimator.rigs.units import axis_label
+from estimator.support.array_types import FloatArray
 
 _N_RESAMPLES = 2000
 
@@ -116,10 +116,10 @@ def metric_columns(names: Iterable[str], input_unit: str = "V") -> dict[str, Met
     }
     columns = METRIC_COLUMNS
     if input_unit != "V":
-        power = labelled("input power", input_unit)
+        power = axis_label("input power", input_unit)
         powers = {
             "input_power": power if input_unit == "1" else f"{power}²",
-            "input_peak": labelled("input peak", input_unit),
+            "input_peak": axis_label("input peak", input_unit),
         }
         columns = METRIC_COLUMNS | {name: MetricColumn(title, -4) for name, title in powers.items()}
     return errors | {name: metric for name, metric in columns.items() if name in names}

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.extras import need
-from estimator.files import write_atomically
-from estimator.page import plain
-from estimator.units import labelled
+from estimator.rigs.units import axis_label
+from estimator.support.file_io import write_atomically
+from estimator.support.html_page import figure_label
+from estimator.support.optional_dependencies import require_packages
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +41,7 @@ def save_png(figure: Figure, path: Path) -> None:
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of this size [inch], for any backend."""
-    need("matplotlib")
+    require_packages("matplotlib")
     from matplotlib.figure import Figure
 
     return Figure((width, height), layout="constrained", dpi=120)
@@ -95,7 +95,7 @@ def plot_posterior_contraction(evaluations: list[Evaluation], title: str = "") -
         lowest = min(lowest, low.min())
         samples = np.arange(len(median))
         axes.fill_between(samples, low, high, color=colour, alpha=0.15, linewidth=0)
-        axes.plot(samples, median, line_style, color=colour, label=plain(evaluation.title))
+        axes.plot(samples, median, line_style, color=colour, label=figure_label(evaluation.title))
     axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
     axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
@@ -123,15 +123,15 @@ def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         first_sensor = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
         lines = (
-            (labelled("u", unit), time, scales.input * evaluation.inputs[:, 0]),
-            (labelled("y", scales.output_unit), time, scales.output * first_sensor),
-            (labelled("|U|", spectrum_unit), frequencies, spectrum),
+            (axis_label("u", unit), time, scales.input * evaluation.inputs[:, 0]),
+            (axis_label("y", scales.output_unit), time, scales.output * first_sensor),
+            (axis_label("|U|", spectrum_unit), frequencies, spectrum),
         )
         for axes, (label, x, y) in zip(row, lines, strict=True):
             axes.plot(x, y, color=colour, linewidth=0.8, drawstyle="steps-post" if axes is row[0] else "default")
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
-        row[0].set_title(plain(evaluation.title), loc="left", fontsize=9)
+        row[0].set_title(figure_label(evaluation.title), loc="left", fontsize=9)
     for panels, scale, limit in zip(grid.T, (scales.input, scales.output), evaluations[0].limits, strict=False):
         values = np.concatenate([axes.lines[0].get_ydata() for axes in panels])
         if np.nanmax(np.abs(values), initial=0.0) > _SHOW_LIMIT_FROM * scale * limit:
@@ -156,7 +156,7 @@ def plot_error_against_information(evaluations: list[Evaluation]) -> Figure | No
         errors = np.mean([v for name, v in evaluation.metrics.items() if name.startswith("error_")], axis=0)
         axes.semilogy(
             evaluation.metrics["fisher_gain"], 100 * errors, ".", color=colour, alpha=0.5, markersize=4,
-            label=plain(evaluation.title),
+            label=figure_label(evaluation.title),
         )  # fmt: skip
     axes.set(xlabel="Fisher information / nat", ylabel="mean error of the parameters / %")
     axes.grid(alpha=0.3)
@@ -176,7 +176,9 @@ def plot_calibration(evaluations: list[Evaluation]) -> Figure:
         axes.plot([0, 100], [0, 100], color="#888888", linewidth=1)
         for evaluation, values, colour in zip(evaluations, metrics_by_estimator, cycle(_COLOURS), strict=False):
             covered = [100 * float(np.mean(values[estimator][name])) for name in CREDIBLE_LEVELS]
-            axes.plot(nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=plain(evaluation.title))
+            axes.plot(
+                nominal, covered, "o-", color=colour, linewidth=0.8, markersize=4, label=figure_label(evaluation.title)
+            )
         axes.set_title(estimator.replace("_", " "), fontsize=9)
         axes.set_xlabel("nominal level / %")
         axes.grid(alpha=0.3)

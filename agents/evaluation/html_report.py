@@ -22,8 +22,8 @@ from agents.evaluation.figures import (
     plot_posterior_contraction,
 )
 from agents.evaluation.policy_evaluation import Evaluation
-from estimator.files import write_atomically
-from estimator.page import page, svg, table
+from estimator.support.file_io import write_atomically
+from estimator.support.html_page import figure_to_svg, html_document, html_table
 
 
 def write_html_report(
@@ -68,14 +68,16 @@ def write_html_report(
         f"<p>{settings['systems']} systems, seed {settings['seed']}, the same for every policy; "
         f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
         "<h2>Leaderboard</h2>",
-        table(headings, [[title, *map(_html_metric_cell, cells)] for title, *cells in rows]),
+        html_table(headings, [[title, *map(_html_metric_cell, cells)] for title, *cells in rows]),
         f"<p><small>{_lines_to_sentences(table_caption(evaluations))} An episode that a limit ends counts with what was known by "
         "then.</small></p>",
         _estimator_section(evaluations),
     ]
     for heading, figure, caption in figures:
         if figure is not None:
-            parts.append(f"<h2>{heading}</h2><figure>{svg(figure)}<figcaption>{caption}</figcaption></figure>")
+            parts.append(
+                f"<h2>{heading}</h2><figure>{figure_to_svg(figure)}<figcaption>{caption}</figcaption></figure>"
+            )
     version_list = ", ".join(f"{name} {number}" for name, number in package_versions().items())
     parts += [
         "<h2>How this page was made</h2>",
@@ -83,7 +85,7 @@ def write_html_report(
         f"<p><small>{html.escape(version_list)}. "
         '<a href="evaluation.json">evaluation.json</a> beside this page holds all figures.</small></p>',
     ]
-    write_atomically(path, page(title, parts))
+    write_atomically(path, html_document(title, parts))
 
 
 def _lines_to_sentences(lines: str) -> str:
@@ -105,5 +107,5 @@ def _estimator_section(evaluations: list[Evaluation]) -> str:
     return (
         "<h2>What other estimators make of the same inputs and outputs</h2>"
         f"<p>{_lines_to_sentences(AUDITOR_EXPLANATION)} It ranks the inputs; the rows of one policy rank the estimators.</p>"
-        + table(headings, [[html.escape(cell) for cell in row] for row in rows])
+        + html_table(headings, [[html.escape(cell) for cell in row] for row in rows])
     )

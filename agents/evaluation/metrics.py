@@ -12,11 +12,11 @@ from duffing_env.plants.silverbox_record import load_record, regime_input
 from duffing_env.storage.kernel_spec import parameter_names
 from estimator.free_run import free_run
 from estimator.information import fisher_information
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.physical import coefficients_of, to_physical
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of, to_physical
+from estimator.rigs.units import Scales
+from estimator.support.array_types import FloatArray
 
 #: Nominal levels of the intervals whose coverage is reported, by their metric.
 CREDIBLE_LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}

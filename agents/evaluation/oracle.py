@@ -22,10 +22,10 @@ from agents.planning.d_optimality import NominalSystem
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator.engine.feeding import input_degree
-from estimator.files import write_atomically
 from estimator.information import fisher_information, variances
-from estimator.models.difference import difference
-from estimator.parameters import FloatArray
+from estimator.models.difference_equation import difference
+from estimator.support.array_types import FloatArray
+from estimator.support.file_io import write_atomically
 
 ORACLE_FOLDER = Path(__file__).parents[1] / "oracles"
 

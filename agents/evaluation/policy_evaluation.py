@@ -25,16 +25,16 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
 from estimator.belief import Belief
-from estimator.checks import MOST_SEED, printable, whole
 from estimator.maximum_a_posteriori import maximum_a_posteriori
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
-from estimator.parameters import FloatArray, Parameters
-from estimator.physical import coefficients_of
 from estimator.posteriors import posteriors
-from estimator.progress import Tell, untold
-from estimator.rig import Rig
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.rig import Rig
+from estimator.rigs.units import Scales
+from estimator.support.argument_checks import MAX_SEED, check_integer, mask_control_codes
+from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
 AUDITOR = "auditor"
@@ -80,7 +80,7 @@ class Evaluation:
     @property
     def title(self) -> str:
         """The name, without control codes, which a terminal would obey; and of several the number of seeds."""
-        name = printable(self.policy)
+        name = mask_control_codes(self.policy)
         return name if self.seeds == 1 else f"{name} ({self.seeds} seeds)"
 
 
@@ -91,7 +91,7 @@ def evaluate_policies(
     seed: int = 0,
     options: dict[str, Any] | None = None,
     on_policy: Callable[[str], None] | None = None,
-    on_progress: Tell = untold,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> list[Evaluation]:
     """Evaluate policies on common random numbers: the same oscillators and the same noise for all of them.
 
@@ -117,7 +117,7 @@ def evaluate_policies(
         seed: of systems and noise; and of the policies' own randomness.
         options: of the environment.
         on_policy: called with each policy's name before its turn.
-        on_progress: is told the share that is done, and each policy's name (`estimator.progress.progress`).
+        on_progress: is told the share that is done, and each policy's name (`estimator.support.progress.show_progress`).
 
     Raises:
         ValueError: for no policies, an unknown one, a pattern that less than two policies match, fewer than two
@@ -127,8 +127,8 @@ def evaluate_policies(
         raise ValueError(f"policies must be a list of policies, but is {policies!r:.60}; pass [{policies!r:.60}]")
     if not policies:
         raise ValueError("policies must name at least one policy, but names none; pass e.g. uniform")
-    whole("systems", systems, _MAX_SYSTEMS, 2)  # intervals need more than one
-    whole("seed", seed, MOST_SEED, 0)
+    check_integer("systems", systems, _MAX_SYSTEMS, 2)  # intervals need more than one
+    check_integer("seed", seed, MAX_SEED, 0)
     options = TEST_OPTIONS | (options or {})
     groups = [policy_group(name) for name in policies]
     titles = [policy_title(members[0]) if title is None else title for title, members in groups]
@@ -152,7 +152,7 @@ def evaluate_policies(
     return evaluations
 
 
-def _report_fraction_done(on_progress: Tell, done: int, total: int, name: str, fraction: float) -> None:
+def _report_fraction_done(on_progress: ProgressCallback, done: int, total: int, name: str, fraction: float) -> None:
     """Tell the share that is done of all policies."""
     on_progress((done + fraction) / total, name)
 
@@ -183,7 +183,7 @@ def _evaluate_policy(
     seed: int,
     options: dict[str, Any],
     silverbox_information: dict[str, FloatArray],
-    on_progress: Tell,
+    on_progress: ProgressCallback,
 ) -> Evaluation:
     """One policy; ``silverbox_information`` keeps what the Silverbox regime tells of the systems, which are those of all policies."""
     evaluation, beliefs, truth, experiment = run_episodes(
@@ -221,7 +221,12 @@ def _evaluate_policy(
 
 
 def run_episodes(
-    name: Any, env_id: str, systems: int, seed: int, options: dict[str, Any], on_progress: Tell = untold
+    name: Any,
+    env_id: str,
+    systems: int,
+    seed: int,
+    options: dict[str, Any],
+    on_progress: ProgressCallback = ignore_progress,
 ) -> tuple[Evaluation, list[Belief], Any, Experiment]:
     """One episode of every system; the beliefs it ended with, the truth and the experiment.
 

@@ -21,7 +21,7 @@ from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import Policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Inputs (samples,) in the belief's scale, the share of what was wanted that they are, the probability of leaving.
 ScaledBlock = tuple[FloatArray, float, float]

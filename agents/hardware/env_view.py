@@ -12,8 +12,8 @@ from duffing_env.storage.kernel_spec import observation_bounds
 from duffing_env.tracks.rig_plant_env import RigPlantExperiment
 from estimator.belief import Belief
 from estimator.free_run import shown_at
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
+from estimator.rigs.rig import Rig
+from estimator.support.array_types import FloatArray
 
 
 class EnvView:

@@ -26,12 +26,12 @@ from agents.policies import make_policy
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
 from estimator.belief import Belief
-from estimator.files import write_atomically
-from estimator.identification.beliefs import disturbance
-from estimator.identification.checks import disturbed
-from estimator.identification.tables import read_table
-from estimator.rig import Rig
+from estimator.identification.data.text_tables import read_table
+from estimator.identification.diagnostics.validity_checks import disturbance_message
+from estimator.identification.fitting.posterior_belief import disturbance_std
+from estimator.rigs.rig import Rig
 from estimator.saving import save_estimator
+from estimator.support.file_io import write_atomically
 
 #: Fewer outputs do not tell how much noise there is.
 _MIN_OUTPUTS_FOR_NOISE = 64
@@ -207,7 +207,7 @@ def _prior_conflict_warning(rig: Rig, belief: Belief, samples_path: Path) -> str
     u, y = table.inputs, table.columns[table.y]
     if np.isfinite(y).sum() < _MIN_OUTPUTS_FOR_NOISE:
         return ""
-    warning = disturbed(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance(belief))
+    warning = disturbance_message(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance_std(belief))
     return (
         warning
         and f"{warning}; the equation does not hold, or what was believed before is wrong: identify {samples_path} alone"

@@ -27,16 +27,19 @@ from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
 from estimator.belief import Belief, covariance_places
-from estimator.checks import MOST_SEED, SMALLEST, number, whole
-from estimator.files import write_atomically
 from estimator.free_run import free_run
-from estimator.identification.checks import ENOUGH, SLOWEST
-from estimator.identification.columns import headed, unit_of
-from estimator.parameters import FloatArray
-from estimator.physical import propagate
-from estimator.progress import Tell, untold
-from estimator.rig import Rig
-from estimator.rig_prior import rig_prior
+from estimator.identification.data.column_names import name_with_unit, unit_in_name
+from estimator.identification.diagnostics.validity_checks import (
+    MIN_SAMPLES_PER_PERIOD,
+    RECOMMENDED_SAMPLES_PER_PERIOD,
+)
+from estimator.rigs.physical_parameters import propagate_to_physical
+from estimator.rigs.rig import Rig
+from estimator.rigs.rig_prior import rig_prior
+from estimator.support.argument_checks import MAX_SEED, MIN_MAGNITUDE, check_integer, check_number
+from estimator.support.array_types import FloatArray
+from estimator.support.file_io import write_atomically
+from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: Samples of an experiment, which is planned as a whole.
 _MAX_SAMPLES = 2**16
@@ -94,8 +97,8 @@ class ExperimentDesign:
 
     def write(self, path: Path) -> None:
         """A CSV file with time [s] and the input, as `identify` reads them beside an output."""
-        name = headed(self.rig.input.column or "u", self.rig.input.unit)
-        lines = [f"time [s],{name if unit_of(name) else f'{name} [{self.rig.input.unit}]'}"]
+        name = name_with_unit(self.rig.input.column or "u", self.rig.input.unit)
+        lines = [f"time [s],{name if unit_in_name(name) else f'{name} [{self.rig.input.unit}]'}"]
         lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
         write_atomically(path, "\n".join(lines) + "\n")
 
@@ -107,7 +110,7 @@ def design_experiment(
     samples: int = 256,
     bound: float = 0.05,
     seed: int = 0,
-    on_progress: Tell = untold,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> ExperimentDesign:
     """Design the next experiment: a signal for an oscillator at rest.
 
@@ -122,7 +125,7 @@ def design_experiment(
         samples: of the experiment.
         bound: of the probability that the output leaves its range, under the whole belief.
         seed: of the policy, and of the systems that are drawn.
-        on_progress: is told the share that is done (`estimator.progress.progress`).
+        on_progress: is told the share that is done (`estimator.support.progress.show_progress`).
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
@@ -139,16 +142,16 @@ def design_experiment(
         >>> bool(half < (high - low) / 2), unit, found.probability < 0.05, len(found.u)
         (True, 'kg', True, 256)
     """
-    whole("samples", samples, _MAX_SAMPLES, 8)
-    number("bound", bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
-    whole("seed", seed, MOST_SEED, 0)
+    check_integer("samples", samples, _MAX_SAMPLES, 8)
+    check_number("bound", bound, MIN_MAGNITUDE, 1 - MIN_MAGNITUDE, "0.05 is usual")
+    check_integer("seed", seed, MAX_SEED, 0)
     rig = Rig.of(rig)
     belief = rig_prior(rig) if prior is None else prior
     env_view = EnvView(rig, belief, int(samples))
     rng = np.random.default_rng(seed)
     view, limit = ModelView.of(env_view.experiment), float(env_view.experiment.max_output)
     posterior_draws = draw_at_rest(belief, rng, required_draws(bound, MAX_PLANNED_DRAWS))
-    futures = MonteCarloSystems(view.model, posterior_draws, limit, rng, max(0, rig.whole_delay), view.degree)
+    futures = MonteCarloSystems(view.model, posterior_draws, limit, rng, max(0, rig.integer_delay), view.degree)
     systems = sampled_systems(view, belief, futures, int(samples))
     with attribute_user_errors(policy, "policy"):
         policy_object = make_policy(policy, env_view, seed=seed)  # type: ignore[arg-type]
@@ -174,7 +177,7 @@ def design_experiment(
     samples_per_period = 1 / believed_resonance(belief)
     if scale == 0.0 and probability >= bound:
         raise ValueError(
-            undersampling_message(rig.step, samples_per_period) if samples_per_period < SLOWEST else
+            undersampling_message(rig.step, samples_per_period) if samples_per_period < MIN_SAMPLES_PER_PERIOD else
             f"rig must be known well enough to stay in its range, but even without input it leaves it with probability "
             f"{probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a wider range"
         )  # fmt: skip
@@ -182,7 +185,7 @@ def design_experiment(
     log_det_gain, covs = expected_information(view, systems, limit, u)
     if not (np.isfinite(log_det_gain) and np.isfinite(covs).all()):
         raise ValueError(
-            undersampling_message(rig.step, samples_per_period) if samples_per_period < SLOWEST else
+            undersampling_message(rig.step, samples_per_period) if samples_per_period < MIN_SAMPLES_PER_PERIOD else
             "rig must be known well enough for its motion to be followed, but some systems that its guess allows run "
             f"away between two samples; give a narrower guess or a shorter step than {rig.step!r} s"
         )  # fmt: skip
@@ -208,15 +211,16 @@ def design_experiment(
 def undersampling_message(step: float, samples_per_period: float) -> str:
     """What to say of a step [s] at which there are so many samples in a period."""
     return (
-        f"step must be at most 1/{SLOWEST:g} of a period, but is {step:g} s: as believed now, there are "
-        f"{samples_per_period:.1f} samples in a period; sample faster, {ENOUGH} at least"
+        f"step must be at most 1/{MIN_SAMPLES_PER_PERIOD:g} of a period, but is {step:g} s: as believed now, there are "
+        f"{samples_per_period:.1f} samples in a period; sample faster, {RECOMMENDED_SAMPLES_PER_PERIOD} at least"
     )
 
 
 def _expected_stds(belief: Belief, systems: SampledSystems, covs: FloatArray) -> dict[str, float]:
     """Parameter to the median over systems of its standard deviation with these covariances."""
     parameter_covs = [
-        propagate(belief.model, c, cov, belief.scales)[1] for c, cov in zip(systems.coefficients, covs, strict=True)
+        propagate_to_physical(belief.model, c, cov, belief.scales)[1]
+        for c, cov in zip(systems.coefficients, covs, strict=True)
     ]
     stds = np.median(np.sqrt([np.diag(cov) for cov in parameter_covs]), axis=0)
     return dict(zip(belief.parameters(), stds.tolist(), strict=True))
@@ -260,7 +264,7 @@ def _roll_out_policy(
     system: int,
     bound: float,
     seed: int,
-    on_progress: Tell,
+    on_progress: ProgressCallback,
 ) -> ScaledBlock:
     """What a policy answers to a drawn system, as large as it is safe on all."""
     import gymnasium as gym

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy.typing as npt
 
 from agents.user_code import load_object
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
+from estimator.rigs.rig import Rig
+from estimator.support.array_types import FloatArray
 
 
 class HardwarePlant(Protocol):

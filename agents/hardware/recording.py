@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from agents.console_output import check_output_folder, package_versions, replace_non_finite
-from estimator.files import append_atomically, hold, write_atomically, writing
-from estimator.identification.columns import headed
-from estimator.rig import Rig
+from estimator.identification.data.column_names import name_with_unit
+from estimator.rigs.rig import Rig
+from estimator.support.file_io import append_atomically, explain_write_errors, lock_folder, write_atomically
 
 #: Columns of samples.csv. `identify` takes ``time``, ``u`` and ``y``, which are called as the rig calls its columns.
 #: ``time`` is that of the tick, ``clock`` the one when the row was complete; ``u`` the mean of the applied input until
@@ -43,9 +43,9 @@ class Recording:
     def __init__(self, folder: str | Path, manifest: dict[str, Any], rig: Rig) -> None:
         self.folder = Path(folder)
         check_output_folder("out", self.folder)
-        with writing(self.folder):
+        with explain_write_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-        self._folder_lock = hold("out", self.folder)
+        self._folder_lock = lock_folder("out", self.folder)
         try:
             self._create_files(manifest, rig)
         except BaseException:
@@ -63,7 +63,7 @@ class Recording:
             "ended": None,
         }
         self._write_manifest()
-        names = {n: headed(one.column or n, one.unit) for n, one in (("u", rig.input), ("y", rig.output))}
+        names = {n: name_with_unit(one.column or n, one.unit) for n, one in (("u", rig.input), ("y", rig.output))}
         append_atomically(self.samples, ",".join(names.get(name, name) for name in SAMPLE_COLUMNS) + "\n")
 
     @property

@@ -15,13 +15,13 @@ from agents.planning.open_loop.posterior_samples import SystemDraws, draw_from_e
 from estimator.arrays import copy as copy_numbers
 from estimator.belief import Belief, covariance_places
 from estimator.engine.motion import motion
-from estimator.identification.beliefs import refit
+from estimator.identification.fitting.posterior_belief import refit_coefficients
 from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
-from estimator.rig_prior import begun_again, rig_prior
+from estimator.rigs.rig import Rig
+from estimator.rigs.rig_prior import reset_state, rig_prior
+from estimator.support.array_types import FloatArray
 
 #: A pause is of an unknown length up to so many periods, and never more samples.
 _MAX_PAUSE_PERIODS, _MAX_PAUSE_SAMPLES = 2.0, 4_000
@@ -97,8 +97,8 @@ class RunEstimator:
                 "rig must have a guess of m, c, a and b for a run, but has none; add one, or go on from a posterior"
             )
         # What came before an output is given with it: so the belief is that of the tick, before the next input.
-        self.delay, causal_rig = rig.whole_delay, replace(rig, delay=rig.whole_delay - 1)
-        prior = rig_prior(rig) if prior is None else begun_again(prior)
+        self.delay, causal_rig = rig.integer_delay, replace(rig, delay=rig.integer_delay - 1)
+        prior = rig_prior(rig) if prior is None else reset_state(prior)
         self._n_pauses = 0
         self._start_components: list[tuple[float, FloatArray, FloatArray]] = []
         self._systems_after_pause: SystemDraws | None = None
@@ -152,7 +152,10 @@ class RunEstimator:
         self._blocks.append((u, y))
         if len(self._blocks) == 1:
             return
-        coefficients, first_pass = refit(self._rig, self._blocks, self._prior, self.belief), self.online.arrays()
+        coefficients, first_pass = (
+            refit_coefficients(self._rig, self._blocks, self._prior, self.belief),
+            self.online.arrays(),
+        )
         # Where the rig is now is what the block tells of a rig with these coefficients.
         self.online.restore(initial_arrays)
         self._start_components = components
@@ -165,7 +168,7 @@ class RunEstimator:
 
     def compile_block_update(self) -> None:
         """Compile what `update_block` calls."""
-        refit(self._rig, [(np.zeros(8), np.zeros(8))] * 2, self._prior, self.belief)
+        refit_coefficients(self._rig, [(np.zeros(8), np.zeros(8))] * 2, self._prior, self.belief)
 
     def draw_systems(self, rng: np.random.Generator) -> SystemDraws:
         """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.

@@ -46,21 +46,28 @@ class RunSettings:
 
     def _check(self) -> None:
         from agents.predict_checks import MAX_SAMPLES
-        from estimator.checks import MOST_SEED, SMALLEST, flag, number, shown, whole
+        from estimator.support.argument_checks import (
+            MAX_SEED,
+            MIN_MAGNITUDE,
+            check_bool,
+            check_integer,
+            check_number,
+            short_repr,
+        )
 
         ranges = {
             "samples": (1, MAX_SAMPLES), "listen": (1, MAX_SAMPLES), "stale": (0, MAX_SAMPLES),
-            "block": (8, MAX_SAMPLES), "seed": (0, MOST_SEED),
+            "block": (8, MAX_SAMPLES), "seed": (0, MAX_SEED),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             if name != "block" or self.block is not None:
-                whole(name, getattr(self, name), most, least)
+                check_integer(name, getattr(self, name), most, least)
         if not isinstance(self.policy, str):
-            raise ValueError(f"policy must be a name, but is {shown(self.policy)}; see agents.POLICIES")
-        number("bound", self.bound, SMALLEST, 1 - SMALLEST, "0.05 is usual")
+            raise ValueError(f"policy must be a name, but is {short_repr(self.policy)}; see agents.POLICIES")
+        check_number("bound", self.bound, MIN_MAGNITUDE, 1 - MIN_MAGNITUDE, "0.05 is usual")
         if self.watchdog is not None:
-            number("watchdog", self.watchdog, remedy="it is in seconds")
-        flag("no_watchdog", self.no_watchdog)
+            check_number("watchdog", self.watchdog, remedy="it is in seconds")
+        check_bool("no_watchdog", self.no_watchdog)
 
     def watchdog_timeout(self, sampling_step: float) -> float | None:
         """Seconds that the watchdog is told; None for none."""

@@ -14,9 +14,9 @@ import numpy as np
 from agents.hardware.plant_interface import HardwarePlant
 from agents.interruption import InterruptHandler
 from duffing_env.tracks.rig_plant_env import as_number
-from estimator.checks import shown
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
+from estimator.rigs.rig import Rig
+from estimator.support.argument_checks import short_repr
+from estimator.support.array_types import FloatArray
 
 Value = TypeVar("Value")
 
@@ -166,7 +166,7 @@ class Session:
         try:
             applied, y = (np.array(one, dtype=np.float64) for one in answer)
         except (TypeError, ValueError):
-            raise SafetyStop("plant", f"{requirement} {shown(answer)}") from None
+            raise SafetyStop("plant", f"{requirement} {short_repr(answer)}") from None
         if applied.shape != clamped.shape or y.shape != clamped.shape:
             raise SafetyStop("plant", f"{requirement} {applied.shape}, {y.shape}")
         self._check_applied(applied)

@@ -14,7 +14,7 @@ from agents.hardware.recording import Recording
 from agents.hardware.run_estimator import RunEstimator
 from agents.hardware.safety_session import SafetyStop, Session
 from agents.policies import Policy
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: A tick that is met later than this, in parts of the sampling step, is missed.
 MAX_TICK_DELAY = 0.1

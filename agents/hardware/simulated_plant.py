@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.hardware.clock import Clock, RealClock
-from estimator.checks import MOST_SEED, number, shown, whole
-from estimator.models.duffing import KINDS
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
-from estimator.units import SIZES
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
+from estimator.rigs.rig import Rig
+from estimator.rigs.units import MAGNITUDE_BOUNDS
+from estimator.support.argument_checks import MAX_SEED, check_integer, check_number, short_repr
+from estimator.support.array_types import FloatArray
 
 #: Runge-Kutta steps of a sampling step.
 _RK4_SUBSTEPS = 8
@@ -65,7 +65,7 @@ class SimulatedPlant:
             )
         if truth is not None:
             check_true_parameters(truth)
-        whole("seed", seed, MOST_SEED, 0)
+        check_integer("seed", seed, MAX_SEED, 0)
         if rig.delay != 0:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}
@@ -159,7 +159,7 @@ class SimulatedPlant:
         self._integrated_until = time
 
     def _sensor_output(self) -> float:
-        order = KINDS[self.rig.output.kind]
+        order = DERIVATIVE_ORDER_OF_SENSOR[self.rig.output.kind]
         value = (self._x, self._v, self._acceleration(self._x, self._v))[order]
         return value + self.rig.output.offset + self._noise_stds[1] * self._rng.standard_normal()
 
@@ -191,9 +191,14 @@ class SimulatedPlant:
 def check_true_parameters(truth: object) -> None:
     """Refuse what are not m, c, a and b."""
     if not isinstance(truth, Mapping) or set(truth) != set("mcab"):
-        raise ValueError(f"truth must give m, c, a and b, but is {shown(truth)}")
+        raise ValueError(f"truth must give m, c, a and b, but is {short_repr(truth)}")
     for name in "mcab":
-        number(f"truth of {name}", truth[name], SIZES[0] if name == "m" else -SIZES[1], SIZES[1])
+        check_number(
+            f"truth of {name}",
+            truth[name],
+            MAGNITUDE_BOUNDS[0] if name == "m" else -MAGNITUDE_BOUNDS[1],
+            MAGNITUDE_BOUNDS[1],
+        )
 
 
 def plant(rig: Rig, seed: int = 0, truth: Mapping[str, float] | None = None, **instrument: object) -> SimulatedPlant:

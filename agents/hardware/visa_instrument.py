@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from estimator.checks import number, shown
-from estimator.extras import need
-from estimator.parameters import FloatArray
-from estimator.rig import Rig
+from estimator.rigs.rig import Rig
+from estimator.support.argument_checks import check_number, short_repr
+from estimator.support.array_types import FloatArray
+from estimator.support.optional_dependencies import require_packages
 
 #: What each command may have in braces.
 _PLACEHOLDERS = {"set": {"u"}, "watchdog": {"seconds"}, "upload": {"values"}}
@@ -63,15 +63,17 @@ class VisaCommands:
     backend: str = "@py"
 
     def __post_init__(self) -> None:
-        number("instrument.timeout", self.timeout, 1e-3, 3600.0)
+        check_number("instrument.timeout", self.timeout, 1e-3, 3600.0)
         if not isinstance(self.begin, list | tuple) or not all(isinstance(line, str) for line in self.begin):
-            raise ValueError(f"instrument.begin must be a list of texts, such as ['*RST'], but is {shown(self.begin)}")
+            raise ValueError(
+                f"instrument.begin must be a list of texts, such as ['*RST'], but is {short_repr(self.begin)}"
+            )
         for field in fields(self):
             value, allowed = getattr(self, field.name), _PLACEHOLDERS.get(field.name, set())
             if field.name in ("timeout", "begin") or (value is None and field.default is None):
                 continue
             if not isinstance(value, str):
-                raise ValueError(f"instrument.{field.name} must be a text, but is {shown(value)}")
+                raise ValueError(f"instrument.{field.name} must be a text, but is {short_repr(value)}")
             if field.name in ("resource", "termination", "backend"):
                 continue
             placeholders = {name for _, name, _, _ in string.Formatter().parse(value) if name is not None}
@@ -94,7 +96,7 @@ class VisaInstrument:
     """
 
     def __init__(self, rig: Rig, commands: VisaCommands) -> None:
-        need("pyvisa")
+        require_packages("pyvisa")
         import pyvisa
 
         self._commands, self._step = commands, rig.step

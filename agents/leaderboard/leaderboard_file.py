@@ -13,8 +13,8 @@ from agents.console_output import check_output_file, check_output_folder, replac
 from agents.evaluation.comparison_tables import METRIC_COLUMNS, MetricColumn, center_value
 from agents.evaluation.oracle import ORACLE_FOLDER
 from agents.leaderboard.protocol import PROTOCOL_TRACKS, PROTOCOL_VERSION, SCORE_COLUMN, file_digest
-from estimator.checks import printable
-from estimator.files import append_atomically, whole_file, write_atomically
+from estimator.support.argument_checks import mask_control_codes
+from estimator.support.file_io import append_atomically, check_readable_file, write_atomically
 
 #: The board that ships with the package.
 SHIPPED_LEADERBOARD = Path(__file__).parents[1] / "leaderboard.jsonl"
@@ -75,7 +75,9 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
         ValueError: for a line that is not an entry, saying which.
         FileNotFoundError: if there is no such file.
     """
-    text = whole_file(path, "board must be a file of entries", _MAX_BYTES).read_text(encoding="utf-8", errors="replace")
+    text = check_readable_file(path, "board must be a file of entries", _MAX_BYTES).read_text(
+        encoding="utf-8", errors="replace"
+    )
     entries: dict[tuple[str, str], dict[str, Any]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():  # two programs that add at once may leave an empty one
@@ -121,7 +123,7 @@ def entry_cells(entry: dict[str, Any]) -> list[str]:
     metrics = entry["metrics"]
     shifted = [entry["shifted"].get(shift, {}).get("fisher_gain") for shift in _SHIFT_NAMES]
     return [
-        printable(str(entry["name"])),
+        mask_control_codes(str(entry["name"])),
         f"{_format_center(SCORE_COLUMN, entry['score'])} [{', '.join(SCORE_COLUMN.format_value(entry['score'][end]) for end in ('low', 'high'))}]",
         str(entry["seeds"]),
         str(entry["budget"]),
@@ -135,13 +137,13 @@ def entry_cells(entry: dict[str, Any]) -> list[str]:
 
 def write_leaderboard_page(path: Path, entries: Sequence[dict[str, Any]]) -> None:
     """Write a page of the boards, which opens without a network."""
-    from estimator.page import page, table
+    from estimator.support.html_page import html_document, html_table
 
     parts = ["<h1>Leaderboard</h1>", f"<p>{LEADERBOARD_CAPTION}</p>"]
     for track, rows in leaderboard_rows(entries).items():
         escaped_rows = [[html.escape(cell) for cell in row] for row in rows]
-        parts += [f"<h2>{html.escape(track)}</h2>", table(COLUMN_TITLES, escaped_rows)]
-    write_atomically(path, page("Leaderboard", parts))
+        parts += [f"<h2>{html.escape(track)}</h2>", html_table(COLUMN_TITLES, escaped_rows)]
+    write_atomically(path, html_document("Leaderboard", parts))
 
 
 LEADERBOARD_CAPTION = (

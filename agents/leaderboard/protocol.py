@@ -24,9 +24,9 @@ from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import CARD_FILE, MAX_STEPS, WEIGHTS_FILE, training_steps_of
 from agents.user_code import load_object
-from estimator.checks import whole
-from estimator.parameters import FloatArray
-from estimator.progress import Tell, untold
+from estimator.support.argument_checks import check_integer
+from estimator.support.array_types import FloatArray
+from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: Of the protocol: entries of another version do not compare.
 PROTOCOL_VERSION = 1
@@ -81,7 +81,7 @@ def measure_policy(
     track: str,
     entry_name: str,
     training_samples: int | None = None,
-    on_progress: Tell = untold,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:
     """What a policy is worth by the protocol, as an entry of a board.
 
@@ -90,7 +90,7 @@ def measure_policy(
         track: one of `PROTOCOL_TRACKS`.
         entry_name: that it has on the board.
         training_samples: that it learned from; a run folder says it itself.
-        on_progress: is told the share that is done, and what is measured next (`estimator.progress.progress`).
+        on_progress: is told the share that is done, and what is measured next (`estimator.support.progress.show_progress`).
 
     Raises:
         ValueError: for another track, a missing name, samples that are no number of them, or something that is not a
@@ -100,7 +100,7 @@ def measure_policy(
         raise ValueError(f"protocol must be one of {', '.join(PROTOCOL_TRACKS)}, but is {track}; others have no oracle")
     if not entry_name.strip():
         raise ValueError("submit must be a name, but is empty; it is what the board shows")
-    whole("samples", 0 if training_samples is None else training_samples, MAX_STEPS, 0)
+    check_integer("samples", 0 if training_samples is None else training_samples, MAX_STEPS, 0)
     _, members = policy_group(policy)
     training_samples = max((_training_samples(member) or training_samples or 0 for member in members), default=0)
     budget = _budget_name(training_samples)
@@ -150,7 +150,7 @@ def measure_policy(
     }
 
 
-def _evaluate_on_track(policy: str, env_id: str, options: dict[str, Any], on_progress: Tell) -> Evaluation:
+def _evaluate_on_track(policy: str, env_id: str, options: dict[str, Any], on_progress: ProgressCallback) -> Evaluation:
     evaluation, _, truth, experiment = run_episodes(policy, env_id, N_SYSTEMS, EVALUATION_SEED, options, on_progress)
     evaluation.metrics["fisher_gain"] = fisher_information_gain(
         evaluation.inputs, truth, experiment, evaluation.outputs

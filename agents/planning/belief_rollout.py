@@ -17,7 +17,7 @@ from estimator.engine.imagination import LOST, imagination
 from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, jit, lanewise, part
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Nats that an output beyond its limit costs, per limit that it is beyond: more than any plan can teach.
 _VIOLATION_COST = 1e4

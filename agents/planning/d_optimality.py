@@ -27,7 +27,7 @@ from estimator.engine.feeding import older_inputs
 from estimator.engine.gradient import pieces
 from estimator.lanes import jit, kernel, part
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: A trajectory is followed no further than to this many times the limit: a difference equation blows up.
 DIVERGED_RATIO = 1.2

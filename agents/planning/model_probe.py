@@ -17,7 +17,7 @@ from estimator.belief import Belief
 from estimator.engine.motion import motion
 from estimator.lanes import kernel
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 
 class ModelView(NamedTuple):

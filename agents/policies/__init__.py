@@ -22,7 +22,7 @@ from agents.policies.feedback import FEEDBACK
 from agents.policies.shield_baseline import ShieldBaseline
 from agents.policies.signals import make_signal
 from agents.user_code import load_object
-from estimator.checks import MOST_SEED, hint, shown, whole
+from estimator.support.argument_checks import MAX_SEED, check_integer, did_you_mean, short_repr
 
 
 class Policy(Protocol):
@@ -102,7 +102,7 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             policy, or `env` is not one of duffing_env; or is a `VecNormalize` that changes observations, under
             which only signals play.
     """
-    whole("seed", seed, MOST_SEED, 0)
+    check_integer("seed", seed, MAX_SEED, 0)
     name = str(name) if isinstance(name, Path) else name
     if not isinstance(name, str):
         return custom_policy(name, env, seed, options)
@@ -128,6 +128,6 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
         return policy
     known_names = [*POLICIES, *trained_policies()]
     raise ValueError(
-        f"policy must be one that is known, the path of a trained one, or module:name of your own, but is {shown(name)}"
-        f"{hint(name, known_names)}; known are {', '.join(known_names)}"
+        f"policy must be one that is known, the path of a trained one, or module:name of your own, but is {short_repr(name)}"
+        f"{did_you_mean(name, known_names)}; known are {', '.join(known_names)}"
     )

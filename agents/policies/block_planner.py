@@ -25,8 +25,8 @@ from agents.planning.open_loop.posterior_samples import (
     required_draws,
 )
 from agents.policies.efe_planner import EfePlanner
-from estimator.checks import whole
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import check_integer
+from estimator.support.array_types import FloatArray
 
 #: Moves after a block that are planned with it, so that it ends where the next can go on.
 _LOOKAHEAD_MOVES = 9
@@ -92,7 +92,7 @@ class BlockPlanner:
 
     def __init__(self, env: Any, seed: int = 0, *, block: int = 16, risk: float = 2.5e-4) -> None:
         self._planner = EfePlanner(env, seed, risk=risk)
-        whole("block", block, _MAX_BLOCK)
+        check_integer("block", block, _MAX_BLOCK)
         if not hasattr(env, "mixture"):
             raise ValueError(
                 f"policy must be 'efe' here, but is 'efe-block-{block}': a design is one block anyway, and a run takes "

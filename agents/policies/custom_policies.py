@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import ActionWrapper, ObservationWrapper, Wrapper
 from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 
-from estimator.checks import numbers, shown
+from estimator.support.argument_checks import short_repr, to_float_array
 
 #: Gymnasium's wrappers that change observations or actions.
 _TRANSFORMING_WRAPPERS = (ObservationWrapper, ActionWrapper, VectorObservationWrapper, VectorActionWrapper)
@@ -60,7 +60,9 @@ def unwrap_vec_env(env: Any, is_signal: bool) -> Any:
         ValueError: for what is no environment, or a `VecEnv` that shows or takes something else than its environment.
     """
     if env is not None and not hasattr(env, "unwrapped"):
-        raise ValueError(f"env must be an environment, but is {shown(env)}; pass what gym.make or gym.make_vec returns")
+        raise ValueError(
+            f"env must be an environment, but is {short_repr(env)}; pass what gym.make or gym.make_vec returns"
+        )
     if not hasattr(env, "env_is_wrapped"):  # which a VecEnv has
         return env
     wrapper = env
@@ -136,7 +138,9 @@ class _NormalisedModel:
 
     def predict(self, observation: npt.ArrayLike, *how: Any, **named: Any) -> Any:
         """As the model's, of the observation itself."""
-        return self._model.predict(self._normalizer.normalize_obs(numbers("observation", observation)), *how, **named)
+        return self._model.predict(
+            self._normalizer.normalize_obs(to_float_array("observation", observation)), *how, **named
+        )
 
 
 class _FunctionPolicy:
@@ -151,7 +155,7 @@ class _FunctionPolicy:
         self, observation: npt.ArrayLike, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """As `agents.policies.Policy`; actions beyond the limits are cut."""
-        seen = numbers("observation", observation).astype(np.float32)
+        seen = to_float_array("observation", observation).astype(np.float32)
         rows = np.atleast_2d(seen)
         if not self._is_module:
             chosen = self._function(rows)

@@ -60,9 +60,9 @@ from agents.planning.model_probe import (
 )
 from agents.planning.receding_horizon import compile_receding_horizon
 from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
-from estimator.checks import SMALLEST, number, numbers, shown, whole
 from estimator.engine.motion import coarsened
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
+from estimator.support.array_types import FloatArray
 
 
 class EfePlannerState(NamedTuple):
@@ -155,10 +155,10 @@ class EfePlanner:
                 f"env must be an environment of duffing_env that simulates a plant, but is {type(env).__name__}; "
                 "the planner needs its beliefs: pass it to make_policy"
             )
-        whole("horizon", _DEFAULT_HORIZON if horizon is None else horizon, _MAX_MOVES)
-        whole("rounds", rounds, 1000)
-        number("risk", risk, SMALLEST, 1 - SMALLEST)
-        number("input_cost", input_cost, 0)
+        check_integer("horizon", _DEFAULT_HORIZON if horizon is None else horizon, _MAX_MOVES)
+        check_integer("rounds", rounds, 1000)
+        check_number("risk", risk, MIN_MAGNITUDE, 1 - MIN_MAGNITUDE)
+        check_number("input_cost", input_cost, 0)
         experiment = env.experiment
         if experiment.hold != 1:
             raise ValueError(
@@ -168,12 +168,12 @@ class EfePlanner:
         if experiment.observation not in ("posterior", "privileged"):
             raise ValueError(
                 f"env must show the posterior, in which the planner looks up the time left, but its observation is "
-                f"{shown(experiment.observation)}; make it with observation='posterior'"
+                f"{short_repr(experiment.observation)}; make it with observation='posterior'"
             )
         setup, self.model_view = experiment.kernel_params, ModelView.of(experiment)
-        number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
+        check_number("goal", goal, -float(setup.max_output), float(setup.max_output), "a goal lies within the limit")
         if goal_std is not None:
-            number("goal_std", goal_std, remedy="None is no goal")
+            check_number("goal_std", goal_std, remedy="None is no goal")
         elif goal:
             raise ValueError(f"goal_std must be given with a goal, but is None for goal={goal!r}; add goal_std=0.05")
         plans_whole_episode = bool(np.isfinite(setup.budget)) and horizon is None
@@ -317,7 +317,7 @@ class EfePlanner:
             ValueError: for an observation that is not finite, or not what ``env`` showed last; or a state or
                 ``episode_start`` that does not go with it.
         """
-        observed, n = numbers("observation", observation), len(self._env.records)
+        observed, n = to_float_array("observation", observation), len(self._env.records)
         min_size = observation_layout(self.model_view.model).size
         if observed.ndim not in (1, 2) or observed.shape[-1] < min_size or observed.size != n * observed.shape[-1]:
             raise ValueError(
@@ -328,7 +328,7 @@ class EfePlanner:
             raise ValueError("observation must be finite, but is not; pass what the environment showed last")
         if state is not None:
             if not isinstance(state, state_type):
-                raise ValueError(f"state must be what the last call returned, or None, but is {shown(state)}")
+                raise ValueError(f"state must be what the last call returned, or None, but is {short_repr(state)}")
             check_batch_size("state", len(state[0]), n)
         observed = observed.reshape(n, -1)
         check_last_observation(self._env, observed)

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duffing_env.plants.silverbox_record import regime_input
-from estimator.checks import whole
-from estimator.models.difference import difference
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
-from estimator.physical import coefficients_of
+from estimator.models.difference_equation import difference
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.support.argument_checks import check_integer
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 
 SignalDraw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
@@ -89,7 +89,7 @@ def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = PRBS_LE
     Raises:
         ValueError: `hold` is no whole number of at least 1.
     """
-    whole("hold", hold, 10**9)
+    check_integer("hold", hold, 10**9)
     return partial(_levels, max_input=max_input, hold=hold, levels=levels)
 
 
@@ -135,7 +135,7 @@ def band_lines(samples: int) -> NDArray[np.int64]:
     Raises:
         ValueError: There is none, which is so below 5 samples.
     """
-    low, high = (edge * samples * SAMPLING_STEP for edge in BAND)
+    low, high = (edge * samples * SILVERBOX_SAMPLING_STEP for edge in BAND)
     lines = np.arange(max(1, int(np.ceil(low))), int(np.floor(high)) + 1)
     if lines.size == 0:
         raise ValueError(
@@ -165,10 +165,10 @@ def draw_chirp(max_input: float, method: str) -> SignalDraw:
 def _chirp(rng: np.random.Generator, samples: int, max_input: float, method: str) -> NDArray[np.float64]:
     from scipy.signal import chirp
 
-    time = SAMPLING_STEP * np.arange(samples)
+    time = SILVERBOX_SAMPLING_STEP * np.arange(samples)
     low, high = BAND
     phase = rng.uniform(0.0, 360.0)
-    return max_input * chirp(time, low, samples * SAMPLING_STEP, high, method=method, phi=phase)
+    return max_input * chirp(time, low, samples * SILVERBOX_SAMPLING_STEP, high, method=method, phi=phase)
 
 
 def draw_square(max_input: float) -> SignalDraw:
@@ -179,7 +179,7 @@ def draw_square(max_input: float) -> SignalDraw:
     oscillator does: see ``square-believed`` and ``velocity-sign`` in `agents.policies.feedback`.
     """
     theta1, _, theta3, _ = coefficients_of(difference(), SILVERBOX_TWIN)
-    step = float(2.0 * np.pi * SAMPLING_STEP * linear_resonance(theta1, theta3))
+    step = float(2.0 * np.pi * SILVERBOX_SAMPLING_STEP * linear_resonance(theta1, theta3))
     return partial(_square, max_input=max_input, step=step)
 
 
@@ -198,7 +198,7 @@ def linear_resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.fl
     """
     modulus = np.sqrt(np.maximum(-np.asarray(theta3), 1e-12))
     angle = np.arccos(np.clip(np.asarray(theta1) / (2.0 * modulus), -1.0, 1.0))
-    return np.clip(angle / (2.0 * np.pi * SAMPLING_STEP), *BAND)
+    return np.clip(angle / (2.0 * np.pi * SILVERBOX_SAMPLING_STEP), *BAND)
 
 
 EXCITATIONS: dict[str, Callable[[float], SignalDraw]] = {

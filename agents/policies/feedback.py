@@ -24,8 +24,8 @@ from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
 from agents.predict_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
-from estimator.checks import numbers
-from estimator.parameters import SAMPLING_STEP
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 BRAKE_FRACTION = 0.7
 """Amplitude beyond which the policies brake, in parts of the displacement that ends the episode.
@@ -36,7 +36,7 @@ the largest displacement was 0.78 of the limit on Amplitude-v0, 0.93 on Output-v
 """
 
 #: Cycles per sample between which a resonance is looked for.
-_RESONANCE_BAND = (BAND[0] * SAMPLING_STEP, BAND[1] * SAMPLING_STEP)
+_RESONANCE_BAND = (BAND[0] * SILVERBOX_SAMPLING_STEP, BAND[1] * SILVERBOX_SAMPLING_STEP)
 
 #: The signs `(n,)` of inputs that need not brake, of velocities and phases of a wave of the believed resonance.
 SignLaw = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -126,7 +126,7 @@ class FeedbackPolicy:
 
     def _rows(self, observation: ArrayLike) -> NDArray[np.float64]:
         """The observations as a batch `(n, features)`."""
-        observed = numbers("observation", observation)
+        observed = to_float_array("observation", observation)
         size = self._layout.size
         if observed.ndim not in (1, 2) or observed.shape[-1] != size:
             raise ValueError(

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from agents.policies.networks.rollout_features import FEATURE_NAMES, FeatureEncoder
 from agents.predict_checks import check_observation_finite, check_observation_size
-from estimator.checks import numbers
+from estimator.support.argument_checks import to_float_array
 
 _VELOCITY = FEATURE_NAMES.index("velocity")
 
@@ -42,7 +42,7 @@ class ShieldBaseline:
         Raises:
             ValueError: for observations of another shape, or that are not finite.
         """
-        observations = numbers("observation", observation).astype(np.float32)
+        observations = to_float_array("observation", observation).astype(np.float32)
         check_observation_size(observations, self._encoder.observation_size)
         check_observation_finite(observations)
         features = self._encoder(np.atleast_2d(observations))

@@ -12,9 +12,9 @@ from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, InputLimits
 from agents.predict_checks import MAX_SAMPLES
-from estimator.checks import MOST_SEED, hint, shown, whole
-from estimator.files import write_atomically
-from estimator.parameters import SAMPLING_STEP
+from estimator.support.argument_checks import MAX_SEED, check_integer, did_you_mean, short_repr
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+from estimator.support.file_io import write_atomically
 
 
 def draw_signal(
@@ -44,12 +44,12 @@ def draw_signal(
         ValueError: An argument is out of its range, or there is no excitation of this name.
     """
     if not isinstance(name, str) or name not in EXCITATIONS:
-        remedy = hint(name, EXCITATIONS)
+        remedy = did_you_mean(name, EXCITATIONS)
         if str(name) in FEEDBACK:
             remedy = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
-        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {shown(name)}{remedy}")
-    whole("samples", samples, MAX_SAMPLES)
-    whole("seed", seed, MOST_SEED, 0)
+        raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {short_repr(name)}{remedy}")
+    check_integer("samples", samples, MAX_SAMPLES)
+    check_integer("seed", seed, MAX_SEED, 0)
     limits = InputLimits(max_input, max_rms)
     generator = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
     return max_input * limits.to_actions(EXCITATIONS[name](max_input)(generator, samples))
@@ -70,7 +70,7 @@ def export_signal(name: str, path: str | Path, **limits: Any) -> NDArray[np.floa
         OSError: The file cannot be written.
     """
     volts = draw_signal(name, **limits)
-    times = (SAMPLING_STEP * np.arange(len(volts))).tolist()
+    times = (SILVERBOX_SAMPLING_STEP * np.arange(len(volts))).tolist()
     rows = [f"{time!r},{value!r}" for time, value in zip(times, volts.tolist(), strict=True)]
     write_atomically(Path(path), "\n".join(["t [s],u [V]", *rows, ""]))
     return volts

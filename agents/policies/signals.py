@@ -16,14 +16,23 @@ from agents.planning.model_probe import believed_resonance
 from agents.policies.excitations import EXCITATIONS, SignalDraw, draw_recorded
 from agents.predict_checks import MAX_SAMPLES, check_batch_size, check_state, episode_starts
 from estimator.belief import Belief
-from estimator.checks import MOST_SEED, SMALLEST, is_finite, numbers, shown, whole
-from estimator.parameters import SAMPLING_STEP
+from estimator.support.argument_checks import (
+    MAX_SEED,
+    MIN_MAGNITUDE,
+    check_integer,
+    is_finite_number,
+    short_repr,
+    to_float_array,
+)
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
-_SILVERBOX_RESONANCE = 68.1 * SAMPLING_STEP  # cycles per sample; the Silverbox's, for which bands and holds are made
+_SILVERBOX_RESONANCE = (
+    68.1 * SILVERBOX_SAMPLING_STEP
+)  # cycles per sample; the Silverbox's, for which bands and holds are made
 _MAX_DRAW_SAMPLES = 2**16  # of an environment's; longer episodes are continued by the next draw
 DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
 
@@ -50,11 +59,11 @@ class InputLimits:
 
     def __post_init__(self) -> None:
         for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
-            if value is not None and not (is_finite(value) and SMALLEST <= value <= 1e300):
+            if value is not None and not (is_finite_number(value) and MIN_MAGNITUDE <= value <= 1e300):
                 raise ValueError(
-                    f"{name} must be positive and finite, in volts, from {SMALLEST} to 1e300, but it is {shown(value)}"
+                    f"{name} must be positive and finite, in volts, from {MIN_MAGNITUDE} to 1e300, but it is {short_repr(value)}"
                 )
-        whole("hold", self.hold, 10**9)
+        check_integer("hold", self.hold, 10**9)
 
     def to_actions(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turns an input into actions within the limits. This is the one place where signals are scaled.
@@ -111,8 +120,8 @@ class SignalPolicy:
         hold: int = 1,
         seed: int = 0,
     ) -> None:
-        whole("samples", samples, MAX_SAMPLES)
-        whole("seed", seed, MOST_SEED, 0)
+        check_integer("samples", samples, MAX_SAMPLES)
+        check_integer("seed", seed, MAX_SEED, 0)
         self.name = name
         self.limits = InputLimits(max_input, max_rms, hold)
         self.samples = samples
@@ -150,7 +159,9 @@ class SignalPolicy:
             ValueError: `observation` has neither one nor two dimensions, or `state` or `episode_start` is for another
                 number of environments.
         """
-        observed = np.shape(observation if isinstance(observation, np.ndarray) else numbers("observation", observation))
+        observed = np.shape(
+            observation if isinstance(observation, np.ndarray) else to_float_array("observation", observation)
+        )
         if len(observed) not in (1, 2):
             raise ValueError(
                 "observation must have the shape (features,) or (environments, features), but its "
@@ -194,7 +205,7 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     if getattr(experiment, "rig", None) is not None:
         hold = hold_for_resonance(experiment.prior_belief, samples)
         silverbox_draw = EXCITATIONS[name](DEFAULT_MAX_INPUT)
-        draw = partial(_stretched_draw, draw=silverbox_draw, hold=hold, worth=limits.max_input / DEFAULT_MAX_INPUT)
+        draw = partial(_stretched_draw, draw=silverbox_draw, hold=hold, amplitude_ratio=limits.max_input / DEFAULT_MAX_INPUT)
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)

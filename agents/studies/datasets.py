@@ -22,8 +22,8 @@ from agents.evaluation.comparison import default_policies
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy, trained_policies
 from agents.user_code import attribute_user_errors
-from estimator.checks import one_of, whole
-from estimator.extras import need
+from estimator.support.argument_checks import check_choice, check_integer
+from estimator.support.optional_dependencies import require_packages
 
 #: Grade to the policy that plays it; the expert is the one that ships for the track.
 POLICIES = {"random": "uniform", "medium": "velocity-sign", "planner": "efe"}
@@ -50,9 +50,9 @@ class Config:
     def __post_init__(self) -> None:
         object.__setattr__(self, "env", full_track_id(self.env))
         check_track_id(self.env)
-        one_of("grade", self.grade, (*POLICIES, "expert"))
-        whole("episodes", self.episodes, _MAX_EPISODES)
-        whole("seed", self.seed, 2**32 - 1, 0)
+        check_choice("grade", self.grade, (*POLICIES, "expert"))
+        check_integer("episodes", self.episodes, _MAX_EPISODES)
+        check_integer("seed", self.seed, 2**32 - 1, 0)
 
     @property
     def policy(self) -> str:
@@ -120,7 +120,7 @@ def main(config: Config) -> None:
         ModuleNotFoundError: without the packages of the extra ``datasets``.
         ValueError: where there is a dataset of this name, before anything is played.
     """
-    need("minari", "h5py")
+    require_packages("minari", "h5py")
     import minari
     from minari.data_collector.episode_buffer import EpisodeBuffer
     from minari.storage import get_dataset_path

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from agents.policies.networks.policy_saving import write_policy
 from agents.policies.networks.trained_policy import WEIGHTS_FILE
-from estimator.files import whole_file, write_atomically, writing
+from estimator.support.file_io import check_readable_file, explain_write_errors, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -71,7 +71,7 @@ def save_checkpoint(
             alone.
     """
     target = run_folder / CHECKPOINTS_FOLDER / f"{model.num_timesteps:09d}"
-    with writing(target):
+    with explain_write_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=run_folder, prefix=_PARTIAL_PREFIX))
     try:
@@ -102,7 +102,7 @@ def load_progress(checkpoint: Path) -> TrainingProgress:
     """
     try:
         content = json.loads(
-            whole_file(checkpoint / STATE_FILE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
+            check_readable_file(checkpoint / STATE_FILE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
         )
         return TrainingProgress(**{**content, "curve": [tuple(point) for point in content["curve"]]})
     except (ValueError, KeyError, TypeError, RecursionError) as error:

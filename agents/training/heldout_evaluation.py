@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from agents.evaluation.policy_evaluation import run_episodes
 from agents.policies.networks.policy_saving import write_policy
 from agents.policies.networks.trained_policy import CARD_FILE
-from estimator.files import write_atomically
+from estimator.support.file_io import write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

@@ -19,8 +19,8 @@ from agents.training.hyperparameters import track_name, write_hyperparameters
 from agents.training.ray_tasks import run_on_ray
 from agents.training.training_config import TrainConfig, claim_run_folder
 from agents.training.training_run import train_or_resume
-from estimator.extras import need
-from estimator.files import held
+from estimator.support.file_io import locked_folder
+from estimator.support.optional_dependencies import require_packages
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -52,13 +52,13 @@ def tune_hyperparameters(config: TrainConfig, trials: int, *, on_ray: bool = Fal
         ModuleNotFoundError: without Optuna, or Ray where that is asked for.
         ValueError: where the folder holds another search, or another process searches in it.
     """
-    need("optuna")
+    require_packages("optuna")
     if on_ray:
-        need("ray")
+        require_packages("ray")
     folder = config.output or Path("runs") / f"tune-{config.algo}-{track_name(config.env).lower()}-{config.seed}"
     folder = folder.resolve()
     claim_run_folder(folder / "search.json", config)
-    with held("output", folder):
+    with locked_folder("output", folder):
         return _run_search(config, folder, trials, on_ray)
 
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
 from agents.training.environments.oscillator_family import FAMILY
-from estimator.checks import hint, one_of, printable
-from estimator.files import whole_file, write_atomically
+from estimator.support.argument_checks import check_choice, did_you_mean, mask_control_codes
+from estimator.support.file_io import check_readable_file, write_atomically
 
 #: Folder of the files that come with the package, ``ALGORITHM.toml``.
 HYPERPARAMETER_FOLDER = Path(__file__).parents[1] / "hyperparameters"
@@ -48,10 +48,12 @@ def read_hyperparameters(algo: str, env_id: str, path: Path | None = None) -> Al
             but for the package's, no table for the track.
         OSError: where the file cannot be read.
     """
-    one_of("algo", algo, ALGORITHMS)
+    check_choice("algo", algo, ALGORITHMS)
     file = HYPERPARAMETER_FOLDER / f"{algo}.toml" if path is None else path
     try:
-        tables = tomllib.loads(whole_file(file, "settings must be a TOML file", 2**20).read_text(encoding="utf-8"))
+        tables = tomllib.loads(
+            check_readable_file(file, "settings must be a TOML file", 2**20).read_text(encoding="utf-8")
+        )
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"settings must be a TOML file, but {file} is not: {error}") from error
     for table, entries in tables.items():
@@ -74,7 +76,7 @@ def parse_hyperparameters(settings_class: type[Settings], entries: Mapping[str, 
     values: dict[str, Any] = {}
     for name, value in entries.items():
         if name not in defaults:
-            raise ValueError(f"{name} is no hyperparameter of {settings_class.__name__}{hint(name, defaults)}")
+            raise ValueError(f"{name} is no hyperparameter of {settings_class.__name__}{did_you_mean(name, defaults)}")
         field_type = type(defaults[name])
         if field_type is float and type(value) is int:
             value = float(value)
@@ -88,7 +90,7 @@ def parse_hyperparameters(settings_class: type[Settings], entries: Mapping[str, 
 
 def write_hyperparameters(path: Path, env_id: str, settings: AlgorithmSettings, comment: str) -> None:
     """Write a file that `read_hyperparameters` reads, with these hyperparameters for this track."""
-    lines = [f"# {printable(comment)}", f"[{table_name(env_id)}]"]
+    lines = [f"# {mask_control_codes(comment)}", f"[{table_name(env_id)}]"]
     lines += [f"{name} = {json.dumps(value)}" for name, value in hyperparameters_to_dict(settings).items()]
     write_atomically(path, "\n".join(lines) + "\n")
 
@@ -107,7 +109,7 @@ def _check_hyperparameter_table(table: str, entries: Any, settings_class: type[A
             *dict.fromkeys(table_name(name) for name in registry if name.startswith("duffing_env/")),
         ]
         raise ValueError(
-            f"settings must have tables [{DEFAULT_TABLE}] or of tracks, but {path} has [{table}]{hint(table, known_tables)}"
+            f"settings must have tables [{DEFAULT_TABLE}] or of tracks, but {path} has [{table}]{did_you_mean(table, known_tables)}"
         )
     try:
         parse_hyperparameters(settings_class, entries)

@@ -11,7 +11,7 @@ from agents.training.hyperparameters import track_name
 from agents.training.ray_tasks import run_on_ray
 from agents.training.training_config import TrainConfig, claim_run_folder, read_config
 from agents.training.training_run import train_or_resume
-from estimator.extras import need
+from estimator.support.optional_dependencies import require_packages
 
 
 def train_seeds(config: TrainConfig, seeds: int, *, on_ray: bool = False) -> Iterator[Path]:
@@ -31,7 +31,7 @@ def train_seeds(config: TrainConfig, seeds: int, *, on_ray: bool = False) -> Ite
         ValueError: where a folder holds another run.
     """
     if on_ray:
-        need("ray")
+        require_packages("ray")
     folder = (config.output or Path("runs") / f"{config.algo}-{track_name(config.env).lower()}").resolve()
     runs = [folder / str(seed) for seed in range(config.seed, config.seed + seeds)]
     begin = None if config.begin is None else config.begin.resolve()

@@ -16,10 +16,10 @@ from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparam
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters
 from agents.user_code import check_env_options, env_spec_of
-from estimator.checks import is_finite, mapping, one_of, shown, whole
-from estimator.extras import need
-from estimator.files import whole_file
 from estimator.lanes import LANES
+from estimator.support.argument_checks import check_choice, check_integer, check_mapping, is_finite_number, short_repr
+from estimator.support.file_io import check_readable_file
+from estimator.support.optional_dependencies import require_packages
 
 #: Rewards that count information.
 INFORMATION_REWARDS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
@@ -79,10 +79,10 @@ class TrainConfig(TrainingSubject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of("algo", self.algo, ALGORITHMS)
+        check_choice("algo", self.algo, ALGORITHMS)
         if not isinstance(self.env, str):
             check_track_id(self.env)
-        mapping("options", self.options)
+        check_mapping("options", self.options)
         check_env_options(self.options)
         # A run has its rig in itself, and not the name of a file that may change.
         object.__setattr__(self, "options", options_with_rig(self.options, self.rig))
@@ -96,9 +96,9 @@ class TrainConfig(TrainingSubject):
             "seed": 2**32 - 1,
         }
         for name, upper_bound in upper_bounds.items():
-            whole(name, getattr(self, name), upper_bound, 0 if name in ("eval_every", "seed") else 1)
+            check_integer(name, getattr(self, name), upper_bound, 0 if name in ("eval_every", "seed") else 1)
         if self.tensorboard:
-            need("tensorboard")
+            require_packages("tensorboard")
         if "reward" in self.options:
             raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
         if "branch" in self.options:
@@ -141,7 +141,7 @@ def _check_observation(config: TrainConfig) -> None:
     observation = {**env_spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
     if observation != "posterior":
         raise ValueError(
-            f"observation must be 'posterior' with features, but is {shown(observation)}; "
+            f"observation must be 'posterior' with features, but is {short_repr(observation)}; "
             f"add --{config.algo.replace('_', '-')}.no-features"
         )
 
@@ -159,7 +159,7 @@ def _check_imitation(config: TrainConfig) -> None:
 
 def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
     """What is varied, each from the lowest to the highest value."""
-    mapping("vary", config.vary)
+    check_mapping("vary", config.vary)
     if config.env == FAMILY or not config.hyperparameters.features or config.reward not in INFORMATION_REWARDS:
         raise ValueError(
             f"vary needs a track, features and a reward that counts information ({', '.join(INFORMATION_REWARDS)}), but env is "
@@ -173,9 +173,9 @@ def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
         raise ValueError(f"vary must not hold what options hold, but both have {duplicates[0]}; leave it out of one")
     for name, bounds in config.vary.items():
         bounds = list(bounds) if isinstance(bounds, list | tuple) else [bounds]
-        if len(bounds) != 2 or not all(is_finite(end) for end in bounds) or not 0 < bounds[0] <= bounds[1]:
+        if len(bounds) != 2 or not all(is_finite_number(end) for end in bounds) or not 0 < bounds[0] <= bounds[1]:
             raise ValueError(
-                f"vary[{name!r}] must be two positive numbers, the lower one first, but is {shown(config.vary[name])}"
+                f"vary[{name!r}] must be two positive numbers, the lower one first, but is {short_repr(config.vary[name])}"
             )
     return {name: list(ends) for name, ends in config.vary.items()}
 
@@ -207,7 +207,7 @@ def claim_run_folder(config_file: Path, config: TrainConfig) -> None:
         if old_settings.get(name) != value:
             raise ValueError(
                 f"output must be a new folder or that of the same command, but in {config_file} {name} is "
-                f"{shown(old_settings.get(name))} instead of {shown(value)}; name another folder"
+                f"{short_repr(old_settings.get(name))} instead of {short_repr(value)}; name another folder"
             )
     if not config_file.exists() or old_content["config"] != described["config"]:
         write_json(config_file, old_content | {"config": described["config"]})
@@ -230,7 +230,9 @@ def contrib_packages(config: TrainConfig) -> tuple[str, ...]:
 def read_config(folder: Path) -> TrainConfig:
     """The configuration that a run folder was made from; what only a script had in it is left out."""
     try:
-        config_file = whole_file(folder / CONFIG_FILE, "resume must be a run folder, with a config.json", 2**20)
+        config_file = check_readable_file(
+            folder / CONFIG_FILE, "resume must be a run folder, with a config.json", 2**20
+        )
         found = json.loads(config_file.read_text(encoding="utf-8"))["config"]
         settings = {f.name: found[f.name] for f in fields(TrainConfig)}
         settings |= {

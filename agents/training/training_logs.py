@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
 
-from estimator.files import writing
+from estimator.support.file_io import explain_write_errors
 
 _STEPS_COLUMN = "time/total_timesteps"
 
@@ -89,17 +89,17 @@ class TensorBoardLog(TensorBoardOutputFormat):
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        with writing(folder):
+        with explain_write_errors(folder):
             super().__init__(str(folder))
 
     def write(self, *row: Any) -> None:
         """Write a row."""
-        with writing(self._folder):
+        with explain_write_errors(self._folder):
             super().write(*row)
 
     def close(self) -> None:
         """Write what is left."""
-        with writing(self._folder):
+        with explain_write_errors(self._folder):
             super().close()
 
 
@@ -122,7 +122,7 @@ class ResumedCSVLog(CSVOutputFormat):
         ]
         replacement = path.with_name(f".{path.name}")
         try:
-            with writing(path):
+            with explain_write_errors(path):
                 super().__init__(str(replacement))
                 if len(kept) > 1:
                     self.keys = kept[0].split(",")
@@ -134,12 +134,12 @@ class ResumedCSVLog(CSVOutputFormat):
 
     def write(self, *row: Any) -> None:
         """Write a row."""
-        with writing(self._path):
+        with explain_write_errors(self._path):
             super().write(*row)
 
     def close(self) -> None:
         """Close the file."""
-        with writing(self._path):
+        with explain_write_errors(self._path):
             super().close()
 
 

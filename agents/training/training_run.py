@@ -39,9 +39,9 @@ from agents.training.training_config import (
     describe_run,
     read_config,
 )
-from estimator.extras import need
-from estimator.files import held, writing
-from estimator.progress import progress
+from estimator.support.file_io import explain_write_errors, locked_folder
+from estimator.support.optional_dependencies import require_packages
+from estimator.support.progress import show_progress
 
 #: Picture of the returns in a run folder.
 LEARNING_CURVE_FILE = "learning_curve.png"
@@ -104,7 +104,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
             written.
         OSError: naming the file that cannot be written; where there is no checkpoint to go on from, nothing is left.
     """
-    need("torch", "stable_baselines3", "matplotlib", *contrib_packages(config))
+    require_packages("torch", "stable_baselines3", "matplotlib", *contrib_packages(config))
     with _create_run_folder(config) as folder, add_resume_hint(lambda message: message or _resume_hint(folder)):
         return _TrainingLoop(config, folder, on_evaluation).run()
 
@@ -128,7 +128,7 @@ def resume(folder: Path, on_evaluation: OnEvaluation = lambda steps, found: None
         raise ValueError(
             f"resume must be a run folder, which holds {CONFIG_FILE}, but {folder} is not one; name a run's"
         )
-    with held("resume", folder), add_resume_hint(lambda message: message or _resume_hint(folder)):
+    with locked_folder("resume", folder), add_resume_hint(lambda message: message or _resume_hint(folder)):
         if (folder / CARD_FILE).exists():
             command = shlex.join(["duffing-env", "train", "--begin", str(folder)])
             raise ValueError(
@@ -181,7 +181,7 @@ class _TrainingLoop:
         elif config.imitate is not None:
             from agents.training.imitation import imitate_policy
 
-            with progress("Imitating") as on_progress:
+            with show_progress("Imitating") as on_progress:
                 imitate_policy(self._model, self._envs, config.imitate, config.imitations, config.seed, on_progress)
         self._n_checkpoints = self._n_checkpoints_due()
         self._evaluator = HeldOutEvaluator(folder, config, first_step)
@@ -228,7 +228,7 @@ class _TrainingLoop:
 
         total, first_step = self._config.steps, self._progress.steps
         with ExitStack() as stack:
-            on_progress = stack.enter_context(progress("Training"))
+            on_progress = stack.enter_context(show_progress("Training"))
             on_progress(first_step / total)
             ended = ""
 
@@ -354,7 +354,7 @@ def _create_run_folder(config: TrainConfig) -> Iterator[Path]:
     folder, number, is_made = config.output or base, 1, False
     created_parents = [place for place in (folder, *folder.parents) if not place.exists()]
     while not is_made:
-        with writing(folder):
+        with explain_write_errors(folder):
             try:
                 folder.mkdir(parents=True, exist_ok=config.output is not None)
                 is_made = True
@@ -362,7 +362,7 @@ def _create_run_folder(config: TrainConfig) -> Iterator[Path]:
                 number += 1
                 folder = base.with_name(f"{base.name}-{number}")
                 created_parents = [folder, *created_parents[1:]]
-    with held("output", folder):
+    with locked_folder("output", folder):
         _check_run_folder(config)  # nobody else had it before
         try:
             yield folder

@@ -43,7 +43,7 @@ from estimator import (
 )
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, log_uniform_moments
-from estimator.units import Scales
+from estimator.rigs.units import Scales
 
 _DECAY = {
     "name": "decay", "states": {"x": "V"}, "coefficients": {"rate": "1"}, "noise": ("1",), "outputs": {"y": "x"},

@@ -11,7 +11,7 @@ from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
 from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE
 from agents.training.checkpoints import STATE_FILE
 from estimator import Rig
-from estimator.extras import how_to_get, is_missing
+from estimator.support.optional_dependencies import install_hint, is_not_installed
 
 TRACK = "duffing_env/Short-v0"
 SMALL = ["--ppo.num-envs", "8", "--ppo.n-steps", "32", "--ppo.batch-size", "64", "--ppo.no-features"]
@@ -277,7 +277,7 @@ class Ray(Train):
     @property
     def missing(self) -> str:  # type: ignore[override]
         """Without Ray."""
-        return how_to_get("ray") if is_missing("ray") else ""
+        return install_hint("ray") if is_not_installed("ray") else ""
 
     def start(self, folder: Path) -> list[str]:
         """The same whenever."""

@@ -8,15 +8,25 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rigs import accuracy, drawn, experiment, faults, loop, peer_rows, peers, sweep, unseen
-from benchmarks.rigs.catalogue import BENCHES
-from estimator.files import write_atomically
+from benchmarks.rigs import (
+    closed_loop,
+    designed_experiment,
+    faults,
+    peer_comparison,
+    peer_methods,
+    random_rigs,
+    rig_accuracy,
+    sampling_sweep,
+    unseen_rigs,
+)
+from benchmarks.rigs.bench_catalogue import BENCHES
+from estimator.support.file_io import write_atomically
 
 CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
-class Written:
+class OutputConfig:
     """What is kept of a part."""
 
     json: Path | None = None
@@ -24,7 +34,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Spread(Written):
+class ParallelConfig(OutputConfig):
     """A part whose runs are spread over processes."""
 
     workers: int = CORES
@@ -32,24 +42,24 @@ class Spread(Written):
 
 
 @dataclass(frozen=True)
-class Accuracy(Spread):
+class AccuracyConfig(ParallelConfig):
     """Errors and coverage on every rig: with guesses off by up to 30 %, with none, and from records in pieces."""
 
     seeds: int = 200
     """Records of each rig and setting."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
-    settings: tuple[str, ...] = accuracy.SETTINGS
+    settings: tuple[str, ...] = rig_accuracy.SETTINGS
     """With a guess, without, and without from 16 pieces that begin in motion."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        cells = accuracy.run(self.rigs, self.settings, self.seeds, self.workers)
-        return {"verdict": accuracy.show(cells), "cells": [cell.to_dict() for cell in cells]}
+        cells = rig_accuracy.run_trials(self.rigs, self.settings, self.seeds, self.workers)
+        return {"verdict": rig_accuracy.print_report(cells), "cells": [cell.to_dict() for cell in cells]}
 
 
 @dataclass(frozen=True)
-class Faults(Spread):
+class FaultsConfig(ParallelConfig):
     """Deliberate faults on rigs a and e: the share that is named, and of good records the share that is flagged."""
 
     seeds: int = 100
@@ -59,29 +69,31 @@ class Faults(Spread):
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        return faults.show(faults.run(self.faults, self.seeds, self.workers))
+        return faults.print_report(faults.run_trials(self.faults, self.seeds, self.workers))
 
 
 @dataclass(frozen=True)
-class Against(Written):
+class PeersConfig(OutputConfig):
     """Errors, times and statements against dynamax, SciPy and pysindy, in .venv-peers."""
 
     seeds: int = 20
     """Records of each rig."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
-    against: tuple[str, ...] = tuple(peer_rows.PEERS)
+    against: tuple[str, ...] = tuple(peer_methods.PEERS)
     """The others: dynamax as its documentation has it, dynamax-jit by somebody who knows JAX, scipy, pysindy."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        results = peers.run(self.rigs, self.seeds, self.against)
-        whole = peers.scripts(self.rigs, [peer for peer in peers.TIMED if peer in self.against])
-        return {"verdict": peers.show(results, whole), "results": results}
+        results = peer_comparison.run_comparison(self.rigs, self.seeds, self.against)
+        whole = peer_comparison.script_time_ratios(
+            self.rigs, [peer for peer in peer_comparison.TIMED_PEERS if peer in self.against]
+        )
+        return {"verdict": peer_comparison.print_report(results, whole), "results": results}
 
 
 @dataclass(frozen=True)
-class Sweep(Spread):
+class SweepConfig(ParallelConfig):
     """From 6 to 800 samples per period, and from the linear range to the limit."""
 
     seeds: int = 50
@@ -89,49 +101,49 @@ class Sweep(Spread):
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        cells = sweep.run(self.seeds, self.workers)
-        return {"verdict": sweep.show(cells), "cells": [cell.to_dict() for cell in cells]}
+        cells = sampling_sweep.run_trials(self.seeds, self.workers)
+        return {"verdict": sampling_sweep.print_report(cells), "cells": [cell.to_dict() for cell in cells]}
 
 
 @dataclass(frozen=True)
-class Loop(Spread):
+class ClosedLoopConfig(ParallelConfig):
     """256 samples on the integrator, through Rig-v0 and in blocks, by signals and by the planner."""
 
     seeds: int = 100
     """Runs of each rig, policy and way."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
-    policies: tuple[str, ...] = loop.POLICIES
+    policies: tuple[str, ...] = closed_loop.POLICIES
     """Who chooses: the planner efe, and signals."""
-    ways: tuple[str, ...] = loop.WAYS
+    ways: tuple[str, ...] = closed_loop.PLAY_MODES
     """Sample by sample, and in blocks of 64."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        runs = loop.run(self.rigs, self.policies, self.ways, self.seeds, self.workers)
+        runs = closed_loop.run_trials(self.rigs, self.policies, self.ways, self.seeds, self.workers)
         written = {" ".join(cell): [vars(one) for one in found] for cell, found in runs.items()}
-        return {"verdict": loop.show(runs), "runs": written}
+        return {"verdict": closed_loop.print_report(runs), "runs": written}
 
 
 @dataclass(frozen=True)
-class Unseen(Written):
+class UnseenConfig(OutputConfig):
     """256 samples on six rigs that no network was trained on, by policies for any oscillator and by the planner."""
 
     seeds: int = 20
     """Episodes of each rig and policy."""
-    rigs: tuple[str, ...] = tuple(unseen.RIGS)
+    rigs: tuple[str, ...] = tuple(unseen_rigs.UNSEEN_RIGS)
     """Names of rigs."""
     policies: tuple[str, ...] = ("ppo/universal", "shield", "prbs")
     """Who chooses, beside the planner efe."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        gained = unseen.run(self.rigs, self.policies, self.seeds)
-        return {"worth": unseen.show(gained), "gained": gained}
+        gained = unseen_rigs.run_episodes(self.rigs, self.policies, self.seeds)
+        return {"worth": unseen_rigs.print_report(gained), "gained": gained}
 
 
 @dataclass(frozen=True)
-class Experiment(Spread):
+class ExperimentConfig(ParallelConfig):
     """The next experiment of 256 samples, designed on a record: what was expected of it beside what came."""
 
     seeds: int = 20
@@ -145,13 +157,13 @@ class Experiment(Spread):
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        found = experiment.run(self.rigs, self.policies, self.samples, self.seeds, self.workers)
+        found = designed_experiment.run_trials(self.rigs, self.policies, self.samples, self.seeds, self.workers)
         written = {" ".join(cell): [vars(one) for one in trials] for cell, trials in found.items()}
-        return {"verdict": experiment.show(found), "trials": written}
+        return {"verdict": designed_experiment.print_report(found), "trials": written}
 
 
 @dataclass(frozen=True)
-class Drawn(Spread):
+class RandomRigsConfig(ParallelConfig):
     """Rigs drawn at random and situations of other people's records, each without a guess."""
 
     classes: tuple[str, ...] = ("rigs",)
@@ -163,20 +175,20 @@ class Drawn(Spread):
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
-        found = drawn.run(self.classes, self.count, self.first, self.workers)
+        found = random_rigs.run_trials(self.classes, self.count, self.first, self.workers)
         answers = {name: [vars(one) for one in of_class] for name, of_class in found.items()}
-        return {"rows": drawn.show(found, self.first), "answers": answers}
+        return {"rows": random_rigs.print_report(found, self.first), "answers": answers}
 
 
-Part = (
-    Annotated[Accuracy, tyro.conf.subcommand("accuracy")]
-    | Annotated[Faults, tyro.conf.subcommand("faults")]
-    | Annotated[Against, tyro.conf.subcommand("peers")]
-    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
-    | Annotated[Loop, tyro.conf.subcommand("loop")]
-    | Annotated[Unseen, tyro.conf.subcommand("unseen")]
-    | Annotated[Experiment, tyro.conf.subcommand("experiment")]
-    | Annotated[Drawn, tyro.conf.subcommand("drawn")]
+BenchmarkConfig = (
+    Annotated[AccuracyConfig, tyro.conf.subcommand("accuracy")]
+    | Annotated[FaultsConfig, tyro.conf.subcommand("faults")]
+    | Annotated[PeersConfig, tyro.conf.subcommand("peers")]
+    | Annotated[SweepConfig, tyro.conf.subcommand("sweep")]
+    | Annotated[ClosedLoopConfig, tyro.conf.subcommand("loop")]
+    | Annotated[UnseenConfig, tyro.conf.subcommand("unseen")]
+    | Annotated[ExperimentConfig, tyro.conf.subcommand("experiment")]
+    | Annotated[RandomRigsConfig, tyro.conf.subcommand("drawn")]
 )
 
 
@@ -184,7 +196,7 @@ Part = (
 class Config:
     """Judge `estimator.identify` on rigs that are simulated by an integrator of the benchmark's own."""
 
-    part: tyro.conf.OmitSubcommandPrefixes[Part] = field(default_factory=Accuracy)
+    part: tyro.conf.OmitSubcommandPrefixes[BenchmarkConfig] = field(default_factory=AccuracyConfig)
 
 
 def main(config: Config) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_uniform, word_to_float
 from estimator.lanes import LANES, jit, lanewise
-from estimator.rig_prior import HALF_WIDTH
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 # A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
 _FLOAT32_ROUNDING = 2.0**-22
@@ -95,7 +95,7 @@ def draw_plant_parameters(W, j, params, first_stream, first_parameter):
             if params.parameter_stds[p] < 0.0:
                 value = params.nominal_parameters[p] * math.exp(params.parameter_stds[p] * deviation)
             elif (
-                abs(params.nominal_parameters[p]) > HALF_WIDTH * params.parameter_stds[p]
+                abs(params.nominal_parameters[p]) > STDS_PER_90_PERCENT * params.parameter_stds[p]
                 and value * params.nominal_parameters[p] < 0.0
             ):
                 value = -value  # what is believed to have one sign keeps it

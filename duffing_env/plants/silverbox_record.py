@@ -27,7 +27,7 @@ import platformdirs
 import scipy
 from numpy.typing import NDArray
 
-from estimator.parameters import SAMPLING_STEP
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 ENVIRONMENT_VARIABLE = "SILVERBOX_DATA"
 CSV_NAME = "SNLS80mV.csv"
@@ -279,7 +279,7 @@ def synthesise_arrow(rng: np.random.Generator, samples: int = ARROW_SAMPLES) -> 
     """
     if samples < 1:
         raise ValueError(f"samples must be 1 or more, but it is {samples}")
-    low_pass = scipy.signal.butter(ARROW_ORDER, ARROW_CUTOFF, fs=1.0 / SAMPLING_STEP, output="sos")
+    low_pass = scipy.signal.butter(ARROW_ORDER, ARROW_CUTOFF, fs=1.0 / SILVERBOX_SAMPLING_STEP, output="sos")
     impulse_response = scipy.signal.sosfilt(low_pass, np.eye(1, 4096)[0])
     noise = scipy.signal.sosfilt(low_pass, rng.standard_normal(samples))
     unit_noise = noise / np.linalg.norm(impulse_response)

@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.plants.silverbox_twin`` with the record at hand to print the constants of
-`estimator.parameters.SILVERBOX_TWIN` and of `estimator.parameters.CONTINUOUS_TWIN`.
+`estimator.support.array_types.SILVERBOX_TWIN` and of `estimator.support.array_types.SILVERBOX_ODE_TWIN`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import numpy as np
 
 from duffing_env.plants.silverbox_record import SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, duffing
-from estimator.parameters import Parameters
-from estimator.physical import to_physical
+from estimator.rigs.physical_parameters import to_physical
+from estimator.support.array_types import Parameters
 
 
 def identify_difference_twin(record: SilverboxRecord) -> tuple[Parameters, float]:

@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from duffing_env.rendering.plot_panels import GREY, INK, RULE, ParameterPanel, SignalPanel
 from estimator.belief import Belief
-from estimator.extras import need
 from estimator.models.model import Model
-from estimator.parameters import FloatArray, Parameters
-from estimator.physical import propagate
-from estimator.rig_prior import HALF_WIDTH
-from estimator.units import SUPERSCRIPTS, VOLTS, Scales
+from estimator.rigs.physical_parameters import propagate_to_physical
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
+from estimator.rigs.units import SUPERSCRIPTS, VOLT_SCALES, Scales
+from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.optional_dependencies import require_packages
 
 Frame = npt.NDArray[np.uint8]
 
@@ -60,7 +60,7 @@ class EpisodeRenderer:
     """
 
     def __init__(
-        self, render_mode: str | None, max_input: float, max_output: float, fps: float, scales: Scales = VOLTS
+        self, render_mode: str | None, max_input: float, max_output: float, fps: float, scales: Scales = VOLT_SCALES
     ) -> None:
         self._limits, self._scales = (max_input, max_output), scales
         self._figure_cache: _EpisodeFigure | None = None
@@ -148,7 +148,7 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     shown, parameters = shown_parameters(model), list(model.physical or model.coefficients)
     means, stds = np.full((2, len(shown), len(beliefs)), np.nan)
     with np.errstate(all="ignore"):
-        physical, physical_cov = propagate(model, mean[is_finite], cov[is_finite], scales)
+        physical, physical_cov = propagate_to_physical(model, mean[is_finite], cov[is_finite], scales)
         variances = np.diagonal(physical_cov, axis1=-2, axis2=-1)
     for row, index in enumerate(map(parameters.index, shown)):
         means[row, is_finite] = physical[:, index]
@@ -165,7 +165,7 @@ class _EpisodeFigure:
     def __init__(
         self, max_input: float, max_output: float, scales: Scales, title: str, labels: Mapping[str, float]
     ) -> None:
-        need("matplotlib")
+        require_packages("matplotlib")
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -219,7 +219,7 @@ class _EpisodeFigure:
         for signal_panel, values in zip(self._signals, signals, strict=True):
             signal_panel.update(times, values)
         for parameter_panel, mean, std, true in zip(self._parameters, means, stds, truth, strict=True):
-            parameter_panel.update(times, mean, HALF_WIDTH * std, true)
+            parameter_panel.update(times, mean, STDS_PER_90_PERCENT * std, true)
 
         self._canvas.restore_region(self._background)
         for panel in self._panels:

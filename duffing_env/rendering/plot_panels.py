@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"

@@ -59,8 +59,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from estimator.checks import hint
 from estimator.lanes import jit
+from estimator.support.argument_checks import did_you_mean
 
 
 class RewardHooks(NamedTuple):
@@ -135,5 +135,5 @@ def check_reward(reward: str | Callable[..., Any]) -> None:
     """ValueError for an unknown name."""
     if not callable(reward) and not (isinstance(reward, str) and reward in REWARDS):
         raise ValueError(
-            f"reward must be one of {list(REWARDS)} or a function, but is {reward!r}{hint(reward, REWARDS)}"
+            f"reward must be one of {list(REWARDS)} or a function, but is {reward!r}{did_you_mean(reward, REWARDS)}"
         )

@@ -23,7 +23,7 @@ from estimator.arrays import copy_lanes
 from estimator.engine.feeding import feeder
 from estimator.engine.rows import input_rows
 from estimator.lanes import LANES, part
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Length of the test input: 105 ms.
 TEST_SAMPLES = 64

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from estimator.engine.rows import belief_names, carried_names, layout, trace_names
 from estimator.lanes import part, rows
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 
 #: What a step leaves for an environment's face, in adjacent rows of its block.

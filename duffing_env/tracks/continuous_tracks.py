@@ -7,10 +7,10 @@ from typing import ClassVar
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
-from estimator.checks import one_of
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
+from estimator.support.argument_checks import check_choice
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class ContinuousExperiment(SimulatedExperiment):
     estimator: str = "ode"
 
     def __post_init__(self) -> None:
-        one_of("estimator", self.estimator, ("ode", "nlarx"))
+        check_choice("estimator", self.estimator, ("ode", "nlarx"))
         super().__post_init__()
         if self.reward == "fisher" and self.estimator != "ode":
             raise ValueError(

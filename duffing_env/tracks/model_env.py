@@ -14,12 +14,12 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.storage.kernel_spec import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
-from estimator.checks import number, one_of, shown
 from estimator.models import MODELS
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
 from estimator.priors import gaussian_moments, weak_prior
-from estimator.units import Scales
+from estimator.rigs.units import Scales
+from estimator.support.argument_checks import check_choice, check_number, short_repr
+from estimator.support.array_types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class ModelExperiment(SimulatedExperiment):
             if not isinstance(given, Mapping) or set(given) != set(names):
                 raise ValueError(f"{name} must give the parameters {list(names)}, but is {given!r}")
         for parameter, value in (self.std or {}).items():
-            number(f"std of {parameter}", value)
+            check_number(f"std of {parameter}", value)
         if self.std is not None and self.plant_spread not in (None, 0):
             raise ValueError(
                 f"plant_spread must be 0 or left out where std says how plants are drawn, but is {self.plant_spread!r}"
             )
-        number("sampling_step", self.sampling_step)
-        one_of("interpolation", self.interpolation, ("zero_order", "linear"))
+        check_number("sampling_step", self.sampling_step)
+        check_choice("interpolation", self.interpolation, ("zero_order", "linear"))
         if self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a model, but is {self.factorisation!r}")
         further_noises = self.sensor_noise
@@ -57,9 +57,9 @@ class ModelExperiment(SimulatedExperiment):
             not isinstance(further_noises, list | tuple) or len(further_noises) != self.plant.n_outputs - 1
         ):
             sensors = list(self.plant.outputs)[1:]
-            raise ValueError(f"sensor_noise must be for the sensors {sensors}, but is {shown(further_noises)}")
+            raise ValueError(f"sensor_noise must be for the sensors {sensors}, but is {short_repr(further_noises)}")
         for std in further_noises or ():
-            number("sensor_noise", std)
+            check_number("sensor_noise", std)
 
     @cached_property
     def plant(self) -> Model:
@@ -68,10 +68,12 @@ class ModelExperiment(SimulatedExperiment):
         if isinstance(system, Model):
             return system
         if isinstance(system, str):
-            one_of("system", system, MODELS)
+            check_choice("system", system, MODELS)
             return MODELS[system]()
         if not isinstance(system, Mapping) or not set(system) <= set(Model.__dataclass_fields__):
-            raise ValueError(f"system must be one of {list(MODELS)}, a Model or its fields, but is {shown(system)}")
+            raise ValueError(
+                f"system must be one of {list(MODELS)}, a Model or its fields, but is {short_repr(system)}"
+            )
         return Model(**system)
 
     @property

@@ -16,8 +16,8 @@ from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.rig_prior import HALF_WIDTH, NOISE, OFFSET, rig_prior
+from estimator.rigs.rig_prior import NOISE_STD_FRACTION, OFFSET_STD_FRACTION, STDS_PER_90_PERCENT, rig_prior
+from estimator.support.array_types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
             ("measurement_noise", rig.output, rig.scales.output),
         ):
             if getattr(self, name) is None:
-                object.__setattr__(self, name, NOISE if channel.noise is None else channel.noise / scale)
+                object.__setattr__(self, name, NOISE_STD_FRACTION if channel.noise is None else channel.noise / scale)
         super().__post_init__()
         self._check_fractions()
         for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0), ("mean", None), ("prior", None)):
@@ -73,15 +73,20 @@ class RigExperiment(RigScaling, SimulatedExperiment):
         """Parameter to middle and standard deviation, inside; of m, which is log-normal, minus its logarithm's."""
         rig, model, scales = self.validated_rig, self.plant, self.scales
         assert rig.guess is not None
-        outside = {name: ((low + high) / 2, (high - low) / 2 / HALF_WIDTH) for name, (low, high) in rig.guess.items()}
+        outside = {
+            name: ((low + high) / 2, (high - low) / 2 / STDS_PER_90_PERCENT) for name, (low, high) in rig.guess.items()
+        }
         low, high = rig.guess["m"]
-        outside |= {"u0": (rig.input.offset, OFFSET * scales.input), "y0": (rig.output.offset, OFFSET * scales.output)}
+        outside |= {
+            "u0": (rig.input.offset, OFFSET_STD_FRACTION * scales.input),
+            "y0": (rig.output.offset, OFFSET_STD_FRACTION * scales.output),
+        }
         inside = {}
         for name in model.physical:
             scale = scales.factor(model.dimensions[name])
             inside[name] = outside[name][0] / scale, outside[name][1] / scale
         scale = scales.factor(model.dimensions["m"])
-        inside["m"] = float(np.sqrt(low * high)) / scale, -float(np.log(high / low)) / 2 / HALF_WIDTH
+        inside["m"] = float(np.sqrt(low * high)) / scale, -float(np.log(high / low)) / 2 / STDS_PER_90_PERCENT
         return inside
 
     @cached_property
@@ -115,7 +120,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
 
 
 def _process_noise_std(disturbance: float, gain: float) -> float:
-    """σ_w of a disturbance of the force (`estimator.rig_prior`)."""
+    """σ_w of a disturbance of the force (`estimator.rigs.rig_prior`)."""
     return float(disturbance * gain / np.sqrt(3))
 
 

@@ -18,13 +18,13 @@ from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment_config import MAX_SAMPLES, Experiment, check_prior
 from duffing_env.rewards.reward_registry import kernel_reward
 from estimator.belief import Belief
-from estimator.checks import shown, whole
 from estimator.ensemble import Hypotheses
 from estimator.models.model import Model
-from estimator.parameters import Parameters
-from estimator.rig import Rig
-from estimator.rig_prior import balance, begun_again, rig_prior
-from estimator.units import Scales
+from estimator.rigs.rig import Rig
+from estimator.rigs.rig_prior import equal_effect_log_ratio, reset_state, rig_prior
+from estimator.rigs.units import Scales
+from estimator.support.argument_checks import check_integer, short_repr
+from estimator.support.array_types import Parameters
 
 RigLike = Rig | Mapping[str, Any] | str | Path
 
@@ -142,11 +142,11 @@ class RigPlantExperiment(RigScaling, Experiment):
         if self.prior is not None:
             check_prior(self.prior, self.scales)
         # A posterior's state is that of the end of its record, and the plant is brought to rest.
-        prior = rig_prior(self.validated_rig) if self.prior is None else begun_again(self.prior)
+        prior = rig_prior(self.validated_rig) if self.prior is None else reset_state(self.prior)
         object.__setattr__(self, "prior", prior)
         super().__post_init__()
         self._check_fractions()
-        whole("horizon", self.horizon, MAX_SAMPLES)
+        check_integer("horizon", self.horizon, MAX_SAMPLES)
         if kernel_reward(self.reward).needs_truth:
             raise ValueError(
                 f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
@@ -168,7 +168,7 @@ class RigPlantExperiment(RigScaling, Experiment):
     @property
     def likeliest_log_noise_ratio(self) -> float | None:
         """That of the prior, where each noise is unknown by itself."""
-        return balance(self.prior_belief) if isinstance(self.noise_hypotheses, tuple) else None
+        return equal_effect_log_ratio(self.prior_belief) if isinstance(self.noise_hypotheses, tuple) else None
 
     @property
     def model(self) -> Model:
@@ -287,4 +287,4 @@ def as_number(method_name: str, value: Any) -> float:
             raise TypeError
         return float(number)
     except (TypeError, ValueError):
-        raise TypeError(f"{method_name} must give one number, but gave {shown(value)}") from None
+        raise TypeError(f"{method_name} must give one number, but gave {short_repr(value)}") from None

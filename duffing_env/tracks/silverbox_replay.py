@@ -14,11 +14,11 @@ from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import Experiment
 from duffing_env.plants.silverbox_record import REGIME_NAMES, Regime, load_record
 from estimator.belief import Belief
-from estimator.checks import flag
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
 from estimator.priors import paper_text_prior, published_run_prior, silverbox_prior
+from estimator.support.argument_checks import check_bool
+from estimator.support.array_types import FloatArray
 
 #: Name of a prior to what makes it of a model.
 _PRIOR_FACTORIES: dict[str, Callable[[Model], Belief]] = {
@@ -41,7 +41,7 @@ class ReplayExperiment(Experiment):
 
     def __post_init__(self) -> None:
         for name in ("nonlinear", "as_published"):
-            flag(name, getattr(self, name))
+            check_bool(name, getattr(self, name))
         for name, choices in (("regime", REGIME_NAMES), ("prior", _PRIOR_FACTORIES), ("input_delay", (0, 1))):
             value = getattr(self, name)
             if not isinstance(value, str | int) or value not in choices:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from estimator.models.pendulum import STEP
+from estimator.models.pendulum import PENDULUM_SAMPLING_STEP
 
 #: Limits of the Duffing oscillator's tracks, where they have no others.
 _DUFFING_LIMITS = {"horizon": 256, "max_input": 0.15, "max_output": 0.6}
@@ -16,7 +16,7 @@ _UNKNOWN_NOISES = {"noise_range": 10.0, "noise_hypotheses": 7}
 _PENDULUM_OPTIONS = {
     "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
     "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
-    "sampling_step": STEP,
+    "sampling_step": PENDULUM_SAMPLING_STEP,
     "measurement_noise": 1e-6,
     "noise_shape": 1e6,
     "horizon": 50,

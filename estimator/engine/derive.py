@@ -22,7 +22,7 @@ from functools import cache
 import sympy as sp
 
 from estimator.engine.rows import carried_names
-from estimator.models.model import FUNCTIONS, HIGHEST_POWER, Model, names_of
+from estimator.models.model import FUNCTIONS, MAX_POWER, Model, names_in_expression
 
 Assignments = list[tuple[str, sp.Expr]]
 
@@ -101,7 +101,7 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
     Raises:
         ValueError: naming the text, for what is not an expression, or a name that is not known.
     """
-    names_of(text, known, where)
+    names_in_expression(text, known, where)
     try:
         parsed = sp.sympify(eval(text.strip(), {"__builtins__": {}}, {**_FUNCTIONS, **known}))
     except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
@@ -112,10 +112,8 @@ def parse(text: str, known: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
         raise ValueError(f"expressions of {where} must be finite and real, but {text!r} is {parsed}")
     parsed = parsed.replace(lambda part: part.is_Pow and part.exp.is_Float, lambda p: p.base ** sp.Rational(p.exp))
     for power in parsed.atoms(sp.Pow):
-        if power.exp.is_Number and abs(power.exp) > HIGHEST_POWER:
-            raise ValueError(
-                f"powers of {where} must be from -{HIGHEST_POWER} to {HIGHEST_POWER}, but {text!r} has {power}"
-            )
+        if power.exp.is_Number and abs(power.exp) > MAX_POWER:
+            raise ValueError(f"powers of {where} must be from -{MAX_POWER} to {MAX_POWER}, but {text!r} has {power}")
     return parsed
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from estimator.checks import one_of
 from estimator.lanes import part
 from estimator.models.model import Model
-from estimator.rig import INTERPOLATIONS
+from estimator.rigs.rig import INTERPOLATION_DEGREES
+from estimator.support.argument_checks import check_choice
 
 #: Ways of the input between two samples that depend on these alone, and the degree of the polynomial of each.
-_DEGREES = {name: degree for name, degree in INTERPOLATIONS.items() if degree < 2}
+_DEGREES = {name: degree for name, degree in INTERPOLATION_DEGREES.items() if degree < 2}
 
 
 def input_degree(model: Model, interpolation: str) -> int:
@@ -20,7 +20,7 @@ def input_degree(model: Model, interpolation: str) -> int:
     Raises:
         ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
     """
-    one_of("interpolation", interpolation, _DEGREES)
+    check_choice("interpolation", interpolation, _DEGREES)
     if not model.is_continuous and interpolation != "zero_order":
         raise ValueError(
             f"interpolation must be 'zero_order' for the difference equation {model.name!r}, whose inputs are samples, "

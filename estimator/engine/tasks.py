@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from estimator import elementary
-from estimator.checks import one_of, whole
 from estimator.engine import cache as stored
 from estimator.engine.rows import carried_names, layout, movers_first, path_layout, point_names, trace_names
 from estimator.inference import EXPECTATIONS, MOST_ITERATIONS
 from estimator.lanes import LANES, rows
-from estimator.models.model import CALLED, Model
+from estimator.models.model import GENERATED_FUNCTIONS, Model
 from estimator.straight import straight
+from estimator.support.argument_checks import check_choice, check_integer
 
 
 @straight
@@ -30,7 +30,7 @@ def sqrt(value):
 
 
 #: What generated code may use.
-NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in CALLED if name != "sqrt"}
+NAMES = {"sqrt": sqrt} | {name: getattr(elementary, name) for name in GENERATED_FUNCTIONS if name != "sqrt"}
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def structured(
 def _structured(
     model: Model, degree: int, iterations: int, lanes: int, within: Any, trace: bool, missing: bool, expectations: str
 ) -> Update:
-    whole("iterations", iterations, MOST_ITERATIONS)
-    one_of("expectations", expectations, EXPECTATIONS)
+    check_integer("iterations", iterations, MOST_ITERATIONS)
+    check_choice("expectations", expectations, EXPECTATIONS)
     points = expectations == "sigma_points"
     place = dict(within) if within is not None else layout(model, degree)
     more_rows = [*(trace_names(model, iterations) if trace else ()), *(point_names(model) if points else ())]

@@ -11,27 +11,36 @@ from typing import Any
 
 import numpy as np
 
-from estimator.identification.beliefs import contraction, foreseen, posterior
-from estimator.identification.checks import examine
-from estimator.identification.problem import JUDGED, LATEST, Problem, explicable
-from estimator.identification.records import Record, records_of
-from estimator.identification.result import Result, deviations_of
-from estimator.identification.search import search, spread
-from estimator.models.duffing import KINDS
-from estimator.parameters import FloatArray
-from estimator.progress import progress as shown
-from estimator.progress import untold
-from estimator.rig import Rig
-from estimator.units import Scales
+from estimator.identification.data.record_reader import Record, read_records
+from estimator.identification.diagnostics.validity_checks import run_all_checks
+from estimator.identification.fitting.multistart_search import search_coefficients, spread_along_ridge
+from estimator.identification.fitting.posterior_belief import (
+    contraction_history,
+    one_step_forecasts,
+    posterior_belief,
+)
+from estimator.identification.identification_result import Result, parameter_moments
+from estimator.identification.likelihood.identification_problem import (
+    MAX_UNSTATED_DELAY,
+    TARGET_PARAMETERS,
+    IdentificationProblem,
+    mask_unexplained_outputs,
+)
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
+from estimator.rigs.rig import Rig
+from estimator.rigs.units import Scales
+from estimator.support.array_types import FloatArray
+from estimator.support.progress import ignore_progress
+from estimator.support.progress import show_progress as shown
 
 
 def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: bool = False) -> Result:
     """Identify m, c, a and b of Eq. (1), with offsets and noises, from records.
 
     The coefficients are the most probable ones under the Kalman filter's likelihood of all records, with a Gaussian
-    about them (variational Laplace: `estimator.identification.fit`). The two noises are unknown: hypotheses about their
+    about them (variational Laplace: `estimator.identification.likelihood.laplace_fit`). The two noises are unknown: hypotheses about their
     ratio, each at its best level, are weighed by their free energies, on a grid that is refined. Without a guess in the
-    rig the search begins at the equation tested with smooth bumps (`estimator.identification.start`), and where that
+    rig the search begins at the equation tested with smooth bumps (`estimator.identification.fitting.weak_form`), and where that
     leads nowhere at coefficients that are drawn, always the same.
 
     Args:
@@ -70,46 +79,58 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         (True, 'kg')
     """
     rig = Rig.of(rig)
-    read = records_of(records, rig)
-    is_free = not any(one.u.any() for one in read)
+    parsed_records = read_records(records, rig)
+    is_free = not any(one.u.any() for one in parsed_records)
     rig = replace(rig, guess=None) if is_free else rig
-    with shown("Identifying") if progress else nullcontext(untold) as tell:
-        scales = _scales(rig, read)
-        u = tuple(one.u / scales.input for one in read)
-        y = tuple(explicable(one.y, rig, LATEST) / scales.output for one in read)
-        origin = _origin(rig, y)
-        times = None if all(one.times is None for one in read) else tuple(one.counted(rig.step) for one in read)
-        found = search(Problem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), tell)
-        problem = found.fitter.problem
+    with shown("Identifying") if progress else nullcontext(ignore_progress) as on_progress:
+        scales = _choose_scales(rig, parsed_records)
+        u = tuple(one.u / scales.input for one in parsed_records)
+        y = tuple(mask_unexplained_outputs(one.y, rig, MAX_UNSTATED_DELAY) / scales.output for one in parsed_records)
+        origin = _output_origin(rig, y)
+        times = (
+            None
+            if all(one.times is None for one in parsed_records)
+            else tuple(one.times_in_steps(rig.step) for one in parsed_records)
+        )
+        search_result = search_coefficients(
+            IdentificationProblem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), on_progress
+        )
+        problem = search_result.fitter.problem
         # Forecasts, and checks that compare the equation with others, are of the most probable place of a ridge.
-        along = found if is_free else spread(found, JUDGED)
-        belief, noises = posterior(problem, along)
-        tell(0.9, "checking the result")
-        forecasts = foreseen(found, belief)
-        parameters = deviations_of(belief, along.ridges)
-        warnings = examine(problem, found, along.ridges, belief, parameters, noises["input"], read, forecasts)
-    history = partial(contraction, problem, along, parameters)
-    foresee = partial(foreseen, found, belief)
-    return Result(rig, belief, warnings, tuple(read), forecasts, noises, history, foresee, along.ridges)
-
-
-def _scales(rig: Rig, records: list[Record]) -> Scales:
-    """The rig's, and the records' largest where the rig has none."""
-    largest = max(float(np.abs(one.u).max()) for one in records)
-    is_free = largest == 0.0
-    largest = largest or 1.0
-    widest = max(float(np.nanmax(np.abs(one.y))) for one in records)
-    scales = rig.scales
-    if is_free:  # of these scales a mass of 1 has the gain 1
-        scales = replace(scales, output=scales.output if rig.output.range else widest)
-        return replace(scales, input=scales.displacement / rig.step**2)
-    return replace(
-        scales, input=scales.input if rig.input.limit else largest, output=scales.output if rig.output.range else widest
+        ridge_result = search_result if is_free else spread_along_ridge(search_result, TARGET_PARAMETERS)
+        belief, noises = posterior_belief(problem, ridge_result)
+        on_progress(0.9, "checking the result")
+        forecasts = one_step_forecasts(search_result, belief)
+        parameters = parameter_moments(belief, ridge_result.ridges)
+        warnings = run_all_checks(
+            problem, search_result, ridge_result.ridges, belief, parameters, noises["input"], parsed_records, forecasts
+        )
+    history = partial(contraction_history, problem, ridge_result, parameters)
+    compute_forecasts = partial(one_step_forecasts, search_result, belief)
+    return Result(
+        rig, belief, warnings, tuple(parsed_records), forecasts, noises, history, compute_forecasts, ridge_result.ridges
     )
 
 
-def _origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
+def _choose_scales(rig: Rig, records: list[Record]) -> Scales:
+    """The rig's, and the records' largest where the rig has none."""
+    largest_input = max(float(np.abs(one.u).max()) for one in records)
+    is_free = largest_input == 0.0
+    largest_input = largest_input or 1.0
+    largest_output = max(float(np.nanmax(np.abs(one.y))) for one in records)
+    scales = rig.scales
+    if is_free:  # of these scales a mass of 1 has the gain 1
+        scales = replace(scales, output=scales.output if rig.output.range else largest_output)
+        return replace(scales, input=scales.displacement / rig.step**2)
+    return replace(
+        scales,
+        input=scales.input if rig.input.limit else largest_input,
+        output=scales.output if rig.output.range else largest_output,
+    )
+
+
+def _output_origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
     """Where to count outputs from: their mean, of a displacement that is farther from 0 than it moves; else 0."""
-    seen = np.concatenate(outputs)
-    mean = float(np.nanmean(seen))
-    return mean if KINDS[rig.output.kind] == 0 and abs(mean) > np.nanstd(seen) else 0.0
+    observed = np.concatenate(outputs)
+    mean = float(np.nanmean(observed))
+    return mean if DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind] == 0 and abs(mean) > np.nanstd(observed) else 0.0

@@ -19,7 +19,7 @@ from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_diverge
 from estimator.engine.cache import digest_of
 from estimator.engine.rows import layout as layout_of_update
 from estimator.lanes import LANES, jit, lanewise, of_lane, part, rows
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.straight import straight
 
 #: Precision of the identity x_{t-1} = x_{t-1} between z_t and z_{t-1}: 1/ε of the paper.

@@ -20,7 +20,7 @@ from estimator.engine.rows import belief_names
 from estimator.inference import mean_field
 from estimator.inference.mixture import foretell, leave_out, switch, weigh
 from estimator.lanes import LANES, kernel, part
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 
 

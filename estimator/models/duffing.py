@@ -16,14 +16,14 @@ from __future__ import annotations
 
 from functools import cache
 
-from estimator.checks import flag, one_of
 from estimator.models.model import Model
+from estimator.support.argument_checks import check_bool, check_choice
 
 #: Of the parameters of Eq. (1): powers of the units of input and displacement, and of the second.
-DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
+PARAMETER_DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
 
 #: What a sensor may show, and the number of time derivatives.
-KINDS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+DERIVATIVE_ORDER_OF_SENSOR = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def duffing(
@@ -56,9 +56,9 @@ def duffing(
         "dry_friction": dry_friction,
     }  # fmt: skip
     for name, value in terms.items():
-        flag(name, value)
-    one_of("noise", noise, ("white", "held"))
-    one_of("sensor", sensor, KINDS)
+        check_bool(name, value)
+    check_choice("noise", noise, ("white", "held"))
+    check_choice("sensor", sensor, DERIVATIVE_ORDER_OF_SENSOR)
     return _duffing(*map(bool, terms.values()), noise, sensor)
 
 
@@ -66,13 +66,13 @@ def duffing(
 def _duffing(
     offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: bool, dry_friction: bool, noise: str, sensor: str
 ) -> Model:
-    order = KINDS[sensor]
+    order = DERIVATIVE_ORDER_OF_SENSOR[sensor]
     # The state is the displacement with its offset, where that is what the sensor shows.
     x = "(x - output_offset)" if offsets and order == 0 else "x"
     coefficients = {"stiffness": "1", "cubic": "V⁻²", "damping": "1", "gain": "1"}
     acceleration = f"gain*u - damping*v - stiffness*x - cubic*{x}**3"
     physical = {"m": "step**2/gain", "c": "step*damping/gain", "a": "stiffness/gain", "b": "cubic/gain"}
-    dimensions = dict(DIMENSIONS)
+    dimensions = dict(PARAMETER_DIMENSIONS)
     inverse = {"stiffness": "a*step**2/m", "cubic": "b*step**2/m", "damping": "c*step/m", "gain": "step**2/m"}
     per_step, by_step = (("", ""), ("/step", "*step**1"), ("/step**2", "*step**2"))[order]
 

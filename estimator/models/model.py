@@ -15,52 +15,52 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 
-from estimator.checks import flag, mapping, shown, whole
+from estimator.support.argument_checks import check_bool, check_integer, check_mapping, short_repr
 
 #: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
-_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
 
 #: Functions that expressions may use.
 FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh", "abs")
 
 #: Functions that generated code calls for them: a magnitude is Python's own, and its slope a sign.
-CALLED = tuple("sign" if name == "abs" else name for name in FUNCTIONS)
+GENERATED_FUNCTIONS = tuple("sign" if name == "abs" else name for name in FUNCTIONS)
 
 #: Highest power in an expression: one of a whole number is calculated as a product.
-HIGHEST_POWER = 16
+MAX_POWER = 16
 
 #: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
-RESERVED = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, *CALLED, "capped", "range"})
+RESERVED_NAMES = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, *GENERATED_FUNCTIONS, "capped", "range"})
 
 
 #: What an expression is made of.
-_PARTS = (
+_ALLOWED_SYNTAX = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, ast.Add, ast.Sub, ast.Mult,
     ast.Div, ast.Pow, ast.USub, ast.UAdd,
 )  # fmt: skip
 
 
-def names_of(text: object, known: Collection[str], where: str) -> set[str]:
+def names_in_expression(text: object, allowed: Collection[str], owner: str) -> set[str]:
     """Names that an expression uses, besides `FUNCTIONS`.
 
     Raises:
         ValueError: naming the text, for what is no formula or uses another name than the known ones.
     """
     if not isinstance(text, str) or "__" in text or len(text) > 10_000:
-        raise ValueError(f"expressions of {where} must be short strings without '__', but one is {text!r:.80}")
+        raise ValueError(f"expressions of {owner} must be short strings without '__', but one is {text!r:.80}")
     try:
-        parts = list(ast.walk(ast.parse(text.strip(), mode="eval")))
+        nodes = list(ast.walk(ast.parse(text.strip(), mode="eval")))
     except (SyntaxError, ValueError, RecursionError) as error:
-        raise ValueError(f"expressions of {where} must be formulas, but {text!r} is not one: {error}") from error
-    if not all(isinstance(part, _PARTS) for part in parts):
+        raise ValueError(f"expressions of {owner} must be formulas, but {text!r} is not one: {error}") from error
+    if not all(isinstance(part, _ALLOWED_SYNTAX) for part in nodes):
         raise ValueError(
-            f"expressions of {where} may use + - * / **, brackets and {[*FUNCTIONS]}, but {text!r} uses something else"
+            f"expressions of {owner} may use + - * / **, brackets and {[*FUNCTIONS]}, but {text!r} uses something else"
         )
-    used = {part.id for part in parts if isinstance(part, ast.Name)} - set(FUNCTIONS)
-    unknown = sorted(used.difference(known))
+    used = {part.id for part in nodes if isinstance(part, ast.Name)} - set(FUNCTIONS)
+    unknown = sorted(used.difference(allowed))
     if unknown:
         raise ValueError(
-            f"expressions of {where} may use {sorted(known)} and {sorted(FUNCTIONS)}, but {text!r} uses {unknown}"
+            f"expressions of {owner} may use {sorted(allowed)} and {sorted(FUNCTIONS)}, but {text!r} uses {unknown}"
         )
     return used
 
@@ -116,43 +116,47 @@ class Model:
     inverse: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for given in ("states", "coefficients", "outputs", "physical", "inverse"):
-            mapping(given, getattr(self, given), str)
-        mapping("dimensions", self.dimensions, Sequence)
-        for given in ("noise", "rates", "next_state"):
-            texts = getattr(self, given)
+        for field_name in ("states", "coefficients", "outputs", "physical", "inverse"):
+            check_mapping(field_name, getattr(self, field_name), str)
+        check_mapping("dimensions", self.dimensions, Sequence)
+        for field_name in ("noise", "rates", "next_state"):
+            texts = getattr(self, field_name)
             if isinstance(texts, list):  # as JSON holds it
                 texts = tuple(texts)
-                object.__setattr__(self, given, texts)
+                object.__setattr__(self, field_name, texts)
             if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):
-                raise ValueError(f"{given} must be a tuple of expressions, but is {shown(texts)}; ('1',) has one")
+                raise ValueError(
+                    f"{field_name} must be a tuple of expressions, but is {short_repr(texts)}; ('1',) has one"
+                )
         if not isinstance(self.name, str):
-            raise ValueError(f"name must be a text, but is {shown(self.name)}")
-        flag("held", self.held)
-        whole("substeps", self.substeps, 1000)
-        for given, powers in self.dimensions.items():
+            raise ValueError(f"name must be a text, but is {short_repr(self.name)}")
+        check_bool("held", self.held)
+        check_integer("substeps", self.substeps, 1000)
+        for field_name, powers in self.dimensions.items():
             if len(powers) != 3 or not all(type(power) is int and abs(power) < 100 for power in powers):
-                raise ValueError(f"dimensions of {given} must be three whole numbers, but are {shown(powers)}")
+                raise ValueError(
+                    f"dimensions of {field_name} must be three whole numbers, but are {short_repr(powers)}"
+                )
         names = [*self.states, *self.coefficients, *self.outputs]
         for name in (self.name, *names):
-            if not _NAME.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED:
+            if not _NAME_PATTERN.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED_NAMES:
                 raise ValueError(
-                    f"names must be lower-case identifiers, none of {sorted(RESERVED)}, but one is {name!r}; rename it"
+                    f"names must be lower-case identifiers, none of {sorted(RESERVED_NAMES)}, but one is {name!r}; rename it"
                 )
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
         # Of x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the row P_x_a_b.
-        joined = [f"{i}_{j}" for i in self.names for j in self.names]
-        shared = sorted({pair for pair in joined if joined.count(pair) > 1})
+        joined_names = [f"{i}_{j}" for i in self.names for j in self.names]
+        shared = sorted({pair for pair in joined_names if joined_names.count(pair) > 1})
         if shared:
             raise ValueError(f"pairs of names must be told apart when joined by '_', but {shared} stand twice; rename")
         if bool(self.rates) == bool(self.next_state):
             raise ValueError("either rates or next_state must be given; rates for a differential equation")
-        for given, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
+        for field_name, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
             if len(values) != len(self.states):
                 raise ValueError(
-                    f"{given} must have one expression per state, {len(self.states)}, but has {len(values)}"
+                    f"{field_name} must have one expression per state, {len(self.states)}, but has {len(values)}"
                 )
         if not self.states or not self.outputs:
             raise ValueError("states and outputs must name at least one each, but one of them is empty")
@@ -165,28 +169,28 @@ class Model:
                 f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "
                 f"{list(self.inverse)}"
             )
-        self._check_expressions()
+        self._validate_expressions()
         # By name, in whatever order they are written.
         object.__setattr__(self, "dimensions", {name: self.dimensions[name] for name in self.physical})
         if self.inverse:
             object.__setattr__(self, "inverse", {name: self.inverse[name] for name in self.coefficients})
 
-    def _check_expressions(self) -> None:
+    def _validate_expressions(self) -> None:
         """Refuse those that are no formulas of the names they may use, and what they leave without effect."""
         inputs = ("u",) if self.is_continuous else ("u", "u1", "u2")
         for texts, known in ((self.physical, self.coefficients), (self.inverse, self.physical)):
             for text in texts.values():
-                names_of(text, (*known, "step"), self.name)
-        told = [names_of(text, (*self.names, *inputs), self.name) for text in self.outputs.values()]
-        for sensor, names in zip(self.outputs, told, strict=True):
+                names_in_expression(text, (*known, "step"), self.name)
+        output_names = [names_in_expression(text, (*self.names, *inputs), self.name) for text in self.outputs.values()]
+        for sensor, names in zip(self.outputs, output_names, strict=True):
             if names.isdisjoint(self.names):
                 raise ValueError(f"outputs must show a state or a coefficient each, but {sensor!r} shows none")
-        moving = [names_of(text, (*self.names, *inputs), self.name) for text in self.moves]
-        shaking = [names_of(text, self.names, self.name) for text in self.noise]
-        idle = sorted(set(self.coefficients).difference(*told, *moving, *shaking))
-        if idle:
+        motion_names = [names_in_expression(text, (*self.names, *inputs), self.name) for text in self.moves]
+        noise_names = [names_in_expression(text, self.names, self.name) for text in self.noise]
+        unused = sorted(set(self.coefficients).difference(*output_names, *motion_names, *noise_names))
+        if unused:
             raise ValueError(
-                f"coefficients must stand in an expression, but {idle} do not; use them, or leave them out"
+                f"coefficients must stand in an expression, but {unused} do not; use them, or leave them out"
             )
 
     @property
@@ -246,14 +250,14 @@ class Model:
         return hash(self.digest)
 
     @classmethod
-    def checked(cls, value: object) -> Model:
+    def require_model(cls, value: object) -> Model:
         """The value, which must be a model.
 
         Raises:
             ValueError: where it is not one.
         """
         if not isinstance(value, cls):
-            raise ValueError(f"model must be a Model, but is {shown(value)}; use difference() or duffing()")
+            raise ValueError(f"model must be a Model, but is {short_repr(value)}; use difference() or duffing()")
         return value
 
     def to_dict(self) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """The conditionally linear stochastic pendulum of IO-SMC² (Iqbal et al., ICML 2024): q'' = -p1 sin q - p2 q' + p3 u.
 
-There it is stepped by Euler's rule, under which an oscillation grows by itself, here by 1.8 % a sample. `PENDULUM_MAP`
+There it is stepped by Euler's rule, under which an oscillation grows by itself, here by 1.8 % a sample. `PENDULUM_EULER`
 is that rule, and so the published plant; `PENDULUM` is the differential equation.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 from estimator.models.model import Model
 
 #: Seconds between two samples.
-STEP = 0.05
+PENDULUM_SAMPLING_STEP = 0.05
 
 #: Both states are seen. Time is counted in samples, so the angular velocity w is in rad per sample and the coefficients
 #: are p1 δ², p2 δ and p3 δ². Noise of unit strength would move q by 1 within a sample.
@@ -30,7 +30,7 @@ PENDULUM = Model(
 
 #: The same by Euler's rule. Process noise of unit strength moves w by 1 rad per sample, and so the angle of the next
 #: sample, which the first sensor shows: of an angle alone the noise of this sample would not be seen.
-PENDULUM_MAP = replace(
+PENDULUM_EULER = replace(
     PENDULUM,
     name="pendulum_map",
     rates=(),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Of an input: C (4, 4), N (f, 4) and M (f, f), with which its information is at most C - WᵀN - NᵀW + WᵀMW.
 InformationMoments = tuple[FloatArray, FloatArray, FloatArray]

@@ -12,8 +12,8 @@ import numpy as np
 from scipy import sparse
 
 from agents.planning.projected_gradient import DesignLimits
-from estimator.extras import need
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
+from estimator.support.optional_dependencies import require_packages
 
 
 class LinearProgramme:
@@ -30,7 +30,7 @@ class LinearProgramme:
     """
 
     def __init__(self, samples: int, n: int, output_state: int, limits: DesignLimits) -> None:
-        need("highspy")
+        require_packages("highspy")
         import highspy
 
         self._highspy = highspy

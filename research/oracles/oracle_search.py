@@ -33,9 +33,9 @@ from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from agents.planning.model_probe import ModelView, probe_time_scales
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from estimator.belief import Belief
-from estimator.checks import MOST_SEED, whole
-from estimator.extras import need
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import MAX_SEED, check_integer
+from estimator.support.array_types import FloatArray
+from estimator.support.optional_dependencies import require_packages
 from research.oracles.slp_refinement import refine_input
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -192,15 +192,15 @@ class Config:
     """Search anew and compare, and store nothing."""
 
     def __post_init__(self) -> None:
-        whole("systems", self.systems, _MAX_COUNT)
-        whole("tries", self.tries, _MAX_COUNT)
-        whole("seed", self.seed, MOST_SEED, 0)
-        whole("first (below systems)", self.first, self.systems - 1, 0)
+        check_integer("systems", self.systems, _MAX_COUNT)
+        check_integer("tries", self.tries, _MAX_COUNT)
+        check_integer("seed", self.seed, MAX_SEED, 0)
+        check_integer("first (below systems)", self.first, self.systems - 1, 0)
 
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
-    need("highspy")
+    require_packages("highspy")
     systems = TrackSystems.of(config.env, config.systems, config.options)
     began = time.perf_counter()
     if config.check:

@@ -23,7 +23,7 @@ from agents.planning.projected_gradient import DesignLimits
 from estimator.arrays import copy, fill
 from estimator.lanes import kernel
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 from research.oracles.linear_programme import LinearProgramme
 
 #: The first radius in parts of the amplitude, and the one at which a search ends.

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 from research.oracles.dynamic_programme import cubic_weights, solve_backward
 
 Indices = npt.NDArray[np.int64]

@@ -87,7 +87,7 @@ def main(config: Config) -> None:
     """Play, and print the table."""
     rows, results = [], []
     metrics = {
-        "efficiency": replace(METRIC_COLUMNS["efficiency"], digits=3, scale=1.0),
+        "efficiency": replace(METRIC_COLUMNS["efficiency"], decimals=3, scale=1.0),
         "fisher_gain": METRIC_COLUMNS["fisher_gain"],
     }
     tasks = [(version, *CASES[case - 1]) for version in config.versions for case in config.cases]

@@ -27,7 +27,7 @@ from agents.evaluation.comparison_tables import METRIC_COLUMNS, center_and_inter
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
 from agents.user_code import attribute_user_errors
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 TRACK = "duffing_env/Pendulum-v1"
 

@@ -30,7 +30,7 @@ from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, load_re
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
 from estimator.offline import PEMNARX
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from agents.cli import check_track_id, full_track_id, run_script
-from estimator.extras import need
+from estimator.support.optional_dependencies import require_packages
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Train, and write the policy folder."""
-    need("torch", "stable_baselines3", "sb3_contrib")
+    require_packages("torch", "stable_baselines3", "sb3_contrib")
     import gymnasium as gym
     import torch
     from sb3_contrib import TQC

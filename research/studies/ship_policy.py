@@ -26,7 +26,7 @@ from agents.evaluation.comparison_tables import print_comparison_table, summaris
 from agents.evaluation.policy_evaluation import evaluate_policies, pool_seeds
 from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE
 from agents.training.environments.oscillator_family import FAMILY
-from estimator.files import write_atomically
+from estimator.support.file_io import write_atomically
 from research.studies.unseen_oscillators import draw_unseen_rigs, play_episode
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from agents.evaluation.figures import new_figure
 from estimator import duffing
-from estimator.rig_prior import HALF_WIDTH
-from estimator.units import Scales
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
+from estimator.rigs.units import Scales
 from research.studies.silverbox_protocol import WITHOUT_EXTRAPOLATION
 
 if TYPE_CHECKING:
@@ -88,7 +88,11 @@ def _parameters(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
             if not all(parameter in parameters for parameters in posteriors.values()) or not posteriors:
                 continue  # it is known
             mean, std = np.array([parameters[parameter][:2] for parameters in posteriors.values()]).T
-            low, high, samples = mean - HALF_WIDTH * std, mean + HALF_WIDTH * std, np.array(list(posteriors))
+            low, high, samples = (
+                mean - STDS_PER_90_PERCENT * std,
+                mean + STDS_PER_90_PERCENT * std,
+                np.array(list(posteriors)),
+            )
             panels[parameter].fill_between(samples, low, high, color=_COLOURS[name], alpha=0.2, linewidth=0)
             panels[parameter].plot(samples, mean, color=_COLOURS[name], label=name, linewidth=1)
             limits[parameter] += [low[samples >= _SHOWN_FROM].min(), high[samples >= _SHOWN_FROM].max()]

@@ -21,8 +21,8 @@ import numpy as np
 from duffing_env.plants.silverbox_record import Regime, SilverboxRecord
 from estimator import Model, OnlineEstimator, Rig, difference, duffing, published_run_prior, silverbox_prior
 from estimator.belief import Belief
-from estimator.parameters import FloatArray
-from estimator.rig_prior import HALF_WIDTH
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
+from estimator.support.array_types import FloatArray
 
 MULTISINE = slice(40_650, 127_400)
 TRAINING_SAMPLES = 65_062
@@ -229,4 +229,4 @@ def coverage_of(forecasts: FloatArray, y: FloatArray) -> float:
     mean, variance = forecasts.T
     if np.isnan(variance).any():
         return float("nan")
-    return float(np.mean(np.abs(y - mean) <= HALF_WIDTH * np.sqrt(variance)))
+    return float(np.mean(np.abs(y - mean) <= STDS_PER_90_PERCENT * np.sqrt(variance)))

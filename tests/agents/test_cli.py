@@ -171,7 +171,9 @@ def test_a_bad_reward_is_one_line(script, tmp_path):
     ],
 )
 def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, monkeypatch):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == package else name)
+    monkeypatch.setattr(
+        "estimator.support.optional_dependencies.find_spec", lambda name: None if name == package else name
+    )
     status, _, messages = script(name, *arguments)
     assert status == 2
     assert messages == f"{name}: {package} is not installed; get it with: pip install 'duffing-env[{extra}]'\n"
@@ -179,7 +181,7 @@ def test_a_missing_extra_is_one_line(script, name, arguments, package, extra, mo
 
 
 def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("estimator.support.optional_dependencies.find_spec", lambda name: None)
     arguments = ["--policies", "prbs", "--systems", 2, "--options", '{"horizon": 4}', "--output", "out"]
     assert script("evaluate.py", *arguments)[0] == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["evaluation.json"]

@@ -14,7 +14,7 @@ from tables import table
 
 from agents.commands import main
 from estimator import Rig
-from estimator.rig import SHIPPED
+from estimator.rigs.rig import SHIPPED_RIGS
 
 ROOT = Path(__file__).parents[2]
 TRUTH = {"m": 0.4, "c": 0.6, "a": 2500.0, "b": 4e7}
@@ -246,7 +246,7 @@ def test_a_rig_is_asked_for(run, tmp_path, monkeypatch, capsys):
     assert not Path("other.toml").exists()
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_RIGS)
 def test_a_rig_that_ships_is_listed_and_copied(run, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     assert name in run("rig", "list")[1].split()

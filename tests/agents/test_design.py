@@ -12,8 +12,8 @@ from agents.planning.projected_gradient import DesignLimits, compile_projected_g
 from estimator import SILVERBOX_TWIN, silverbox_prior
 from estimator.engine.gradient import pieces
 from estimator.information import fisher_information
-from estimator.models.difference import difference
-from estimator.physical import coefficients_of
+from estimator.models.difference_equation import difference
+from estimator.rigs.physical_parameters import coefficients_of
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
 from reference.plants import CASES

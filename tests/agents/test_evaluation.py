@@ -25,7 +25,7 @@ from agents.policies.networks.trained_policy import WEIGHTS_FILE, load_policy
 from agents.sb3_vec_env import DuffingVecEnv
 from duffing_env.batch import spawn_seeds
 from duffing_env.plants.silverbox_record import Regime
-from estimator import SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
+from estimator import SILVERBOX_SAMPLING_STEP, OnlineEstimator, Rig, difference, silverbox_prior
 
 TRACK = "duffing_env/Amplitude-v0"
 CONTINUOUS = "duffing_env/Amplitude-v1"
@@ -50,15 +50,15 @@ def without_record(monkeypatch):
 
 def true_coefficients(truth):
     """Eq. (3)."""
-    eta = SAMPLING_STEP**2 / (truth.m + truth.c * SAMPLING_STEP)
-    ratio = truth.m / (truth.m + truth.c * SAMPLING_STEP)
+    eta = SILVERBOX_SAMPLING_STEP**2 / (truth.m + truth.c * SILVERBOX_SAMPLING_STEP)
+    ratio = truth.m / (truth.m + truth.c * SILVERBOX_SAMPLING_STEP)
     return np.array([1 + ratio - truth.a * eta, -truth.b * eta, -ratio, eta])
 
 
 def estimates(coefficients):
     """m, c, a, b by Eq. (4)."""
     theta1, theta2, theta3, eta = coefficients
-    step = SAMPLING_STEP
+    step = SILVERBOX_SAMPLING_STEP
     return np.array([-theta3 * step**2 / eta, (1 + theta3) * step / eta, (1 - theta1 - theta3) / eta, -theta2 / eta])
 
 
@@ -417,15 +417,15 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_recor
             env.step(actions[t][row])
         belief, truth = env.unwrapped.belief, env.unwrapped.truth
         stiffness, cubic, damping, gain = belief.coefficients_mean
-        per_sample = SAMPLING_STEP**2 / truth.m
-        true = [truth.a * per_sample, truth.b * per_sample, truth.c / truth.m * SAMPLING_STEP, per_sample]
+        per_sample = SILVERBOX_SAMPLING_STEP**2 / truth.m
+        true = [truth.a * per_sample, truth.b * per_sample, truth.c / truth.m * SILVERBOX_SAMPLING_STEP, per_sample]
         inside = np.abs(belief.coefficients_mean - true) < QUANTILES["coverage"] * np.sqrt(
             np.diag(belief.coefficients_cov)
         )
         expected = {
             "coverage": np.count_nonzero(inside) / 4,
-            "error_m": abs(SAMPLING_STEP**2 / gain / truth.m - 1),
-            "error_c": abs(SAMPLING_STEP * damping / gain / truth.c - 1),
+            "error_m": abs(SILVERBOX_SAMPLING_STEP**2 / gain / truth.m - 1),
+            "error_c": abs(SILVERBOX_SAMPLING_STEP * damping / gain / truth.c - 1),
             "error_a": abs(stiffness / gain / truth.a - 1),
             "error_b": abs(cubic / gain / truth.b - 1),
         }

@@ -15,10 +15,10 @@ from agents.policies.signal_export import draw_signal, export_signal
 from agents.policies.signals import InputLimits, SignalPolicy
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import observation_bounds
-from estimator.models.difference import difference
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
-from estimator.physical import coefficients_of
+from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 RECORDED = ("silverbox-multisine", "silverbox-arrow")
@@ -35,7 +35,7 @@ def draws(name, count=300, samples=256, max_input=0.15):
 def power(name, low, high, samples=256):
     """The share of the power between two frequencies [Hz], over many draws."""
     density = (np.abs(np.fft.rfft(draws(name, samples=samples))) ** 2).mean(axis=0)
-    frequency = np.fft.rfftfreq(samples, SAMPLING_STEP)
+    frequency = np.fft.rfftfreq(samples, SILVERBOX_SAMPLING_STEP)
     return density[(frequency >= low) & (frequency <= high)].sum() / density.sum()
 
 
@@ -49,7 +49,7 @@ def test_draws_reach_the_limit_and_keep_it(name):
 @table("samples", [48, 255, 256])
 def test_multisines_have_equal_power_on_the_lines_of_the_band_and_none_elsewhere(name, samples):
     density = np.abs(np.fft.rfft(draws(name, 5, samples))) ** 2
-    frequency = np.fft.rfftfreq(samples, SAMPLING_STEP)
+    frequency = np.fft.rfftfreq(samples, SILVERBOX_SAMPLING_STEP)
     inside = (frequency >= 10) & (frequency <= 150)
     assert inside.sum() >= 10
     np.testing.assert_allclose(
@@ -110,7 +110,7 @@ def test_levels_are_five_and_even():
 def test_square_is_a_square_wave_at_the_resonance_of_the_twin():
     u = draws("square", 20, 2048)
     assert set(np.unique(u)) == {-0.15, 0.15}
-    frequency = np.fft.rfftfreq(2048, SAMPLING_STEP)
+    frequency = np.fft.rfftfreq(2048, SILVERBOX_SAMPLING_STEP)
     peaks = frequency[np.abs(np.fft.rfft(u)).argmax(axis=1)]
     np.testing.assert_allclose(peaks, np.sqrt(SILVERBOX_TWIN.a / SILVERBOX_TWIN.m) / (2 * np.pi), atol=0.5)
     assert len(np.unique(u[:, :9], axis=0)) > 3  # the phase is drawn
@@ -127,7 +127,7 @@ def test_resonance_is_where_a_free_oscillation_crosses_zero():
             x.append(theta1 * x[-1] + theta3 * x[-2])
         crossings = np.flatnonzero(np.diff(np.signbit(x[1:])))
         halves = crossings.size - 1
-        measured = halves / (2 * SAMPLING_STEP * (crossings[-1] - crossings[0]))
+        measured = halves / (2 * SILVERBOX_SAMPLING_STEP * (crossings[-1] - crossings[0]))
         found = linear_resonance(theta1, theta3)
         assert found == pytest.approx(measured, rel=2 / (crossings[-1] - crossings[0]))
     assert linear_resonance(np.float64(1.0), np.float64(0.1)) == 10.0  # describes no oscillator
@@ -209,7 +209,7 @@ def test_amplitude_is_that_of_a_sampled_sine():
     policy = make_policy("velocity-sign")
     frequency = policy.frequency(observation()[np.newaxis])
     for phase in np.linspace(0, 6, 7):
-        x0, x1 = 0.3 * np.sin(phase - 2 * np.pi * frequency[0] * SAMPLING_STEP * np.arange(2))
+        x0, x1 = 0.3 * np.sin(phase - 2 * np.pi * frequency[0] * SILVERBOX_SAMPLING_STEP * np.arange(2))
         row = observation(state_x1=x0, state_x2=x1)[np.newaxis].astype(np.float64)
         assert policy.amplitude(row) == pytest.approx(0.3, rel=1e-4)
 
@@ -232,7 +232,7 @@ def test_square_believed_has_the_frequency_of_the_posterior_mean(spread):
         wave.append(action[0])
     assert wave[0] == 1.0
     rises = np.flatnonzero(np.diff(wave) > 0)
-    measured = (rises.size - 1) / (SAMPLING_STEP * (rises[-1] - rises[0]))
+    measured = (rises.size - 1) / (SILVERBOX_SAMPLING_STEP * (rises[-1] - rises[0]))
     assert measured == pytest.approx(natural, rel=0.01)
 
 
@@ -250,9 +250,9 @@ def test_resonance_and_amplitude_are_read_off_equation_1():
     policy, model = make_policy("square-believed", env), env.experiment.model
     prior = env.experiment.prior_belief.coefficients_mean
     row = np.zeros((1, len(observation_bounds(model))))
-    expected = np.sqrt(prior[0] - prior[2] ** 2 / 4) / (2 * np.pi * SAMPLING_STEP)  # of m, c and a
+    expected = np.sqrt(prior[0] - prior[2] ** 2 / 4) / (2 * np.pi * SILVERBOX_SAMPLING_STEP)  # of m, c and a
     assert policy.frequency(row)[0] == pytest.approx(expected, rel=1e-9)
-    omega = 2 * np.pi * SAMPLING_STEP * expected
+    omega = 2 * np.pi * SILVERBOX_SAMPLING_STEP * expected
     for phase in np.linspace(0, 6, 7):
         row[0, list(observation_bounds(model)).index("state_x")] = 0.3 * np.sin(phase)
         row[0, list(observation_bounds(model)).index("state_v")] = 0.3 * omega * np.cos(phase)
@@ -310,7 +310,7 @@ def test_export_round_trip(tmp_path):
     volts = export_signal("multisine", path, samples=100, max_input=0.12, max_rms=0.03, seed=2)
     assert path.read_text().splitlines()[0] == "t [s],u [V]"
     table = np.loadtxt(path, delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(table[:, 0], SAMPLING_STEP * np.arange(100))
+    np.testing.assert_array_equal(table[:, 0], SILVERBOX_SAMPLING_STEP * np.arange(100))
     np.testing.assert_array_equal(table[:, 1], volts)
     assert [entry.name for entry in path.parent.iterdir()] == ["signal.csv"]
 

@@ -10,7 +10,7 @@ from agents.planning.open_loop.posterior_samples import draw_from_records, noise
 from agents.policies import block_planner, make_policy
 from agents.policies.block_planner import BlockPlanner, countable_probability
 from estimator import Belief
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
 

@@ -10,7 +10,7 @@ from tables import table
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
-from estimator import SAMPLING_STEP
+from estimator import SILVERBOX_SAMPLING_STEP
 
 TRACK = "duffing_env/Amplitude-v0"
 HOLD = 4
@@ -60,7 +60,7 @@ def test_a_square_wave_goes_on_by_as_many_samples_as_it_was_held():
         observations, _ = envs.reset(seed=0)
         policy = make_policy("square-believed", envs)
         _, phase = policy.predict(observations)
-        np.testing.assert_allclose(phase, hold * SAMPLING_STEP * policy.frequency(observations), rtol=1e-6)
+        np.testing.assert_allclose(phase, hold * SILVERBOX_SAMPLING_STEP * policy.frequency(observations), rtol=1e-6)
         phases.append(phase)
     np.testing.assert_allclose(phases[1], HOLD * phases[0], rtol=1e-12)
 

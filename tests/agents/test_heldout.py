@@ -87,7 +87,7 @@ def test_tensorboard_holds_both_logs(tmp_path):
 
 
 def test_tensorboard_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("estimator.support.optional_dependencies.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"tensorboard is not installed; get it with: pip .*\[train\]"):
         train(tiny(tmp_path / "run", tensorboard=True))
     assert not (tmp_path / "run").exists()

@@ -15,7 +15,7 @@ from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator.belief import Belief
 from estimator.engine.imagination import LOST, imagination
 from estimator.lanes import LANES
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM

@@ -25,7 +25,7 @@ from agents.leaderboard import leaderboard_file
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import write_hyperparameters
 from estimator import Rig, identify
-from estimator.progress import _bar, progress
+from estimator.support.progress import _terminal_bar, show_progress
 
 NAMES = [
     "<script>alert(1)</script>", "\"><img src=x onerror='alert(1)'>", "&lt;b&gt;", "=cmd|' /C calc'!A0", "+1+1", "-2",
@@ -125,13 +125,13 @@ def test_an_error_is_one_line(name, capsys):
 
 @names
 def test_what_is_being_done(name, capsys, monkeypatch):
-    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
-    with progress("Evaluating") as tell:
+    monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
+    with show_progress("Evaluating") as tell:
         tell(0.5, name)
     said = capsys.readouterr().err
     assert is_tame(said)
     assert len(said.splitlines()) == 1 + said.startswith("\n")  # where a line was begun before
-    with _bar() as show_bar:
+    with _terminal_bar() as show_bar:
         show_bar(0.5, name)
 
 

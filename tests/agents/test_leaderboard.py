@@ -29,8 +29,8 @@ from agents.evaluation.figures import (
     save_png,
 )
 from agents.evaluation.policy_evaluation import Evaluation
-from estimator import SAMPLING_STEP
-from estimator.units import VOLTS, Scales
+from estimator import SILVERBOX_SAMPLING_STEP
+from estimator.rigs.units import VOLT_SCALES, Scales
 
 # What the table must print for these values, by hand: centre, then both ends of an interval of width zero.
 CONSTANTS = {
@@ -69,7 +69,7 @@ def make_evaluation(policy="policy", *, samples=20, systems=30, seed=0, shift=0.
         metrics["log_posterior_gain"] = metrics["log_posterior_gain"] + shift
     curve = np.cumsum(rng.normal(1.0, 0.3, (samples + 1, systems)), axis=0) + shift
     inputs, outputs = rng.uniform(-0.1, 0.1, (2, samples, systems))
-    return Evaluation(policy, metrics, curve, inputs, outputs, VOLTS)
+    return Evaluation(policy, metrics, curve, inputs, outputs, VOLT_SCALES)
 
 
 def test_every_metric_of_an_evaluation_has_a_column(monkeypatch):
@@ -249,7 +249,7 @@ def test_a_rigs_table_and_figure_are_in_its_units():
     (lines,) = near.collections
     np.testing.assert_allclose([segment[:, 1] for segment in lines.get_segments()], [[-2.4, -2.4], [2.4, 2.4]])
     assert not far.collections
-    in_volts = plot_inputs_and_outputs([replace(evaluation, scales=VOLTS)]).axes[2].lines[0].get_ydata()
+    in_volts = plot_inputs_and_outputs([replace(evaluation, scales=VOLT_SCALES)]).axes[2].lines[0].get_ydata()
     np.testing.assert_allclose(spectrum.lines[0].get_ydata(), 20.0 * 1e-3 * in_volts)
 
 
@@ -398,14 +398,14 @@ def test_inputs_shows_one_system_under_every_policy_and_the_spectrum_of_all(poli
         for axes, signal, label in ((left, evaluation.inputs, "u / V"), (middle, evaluation.outputs, "y / V")):
             (line,) = axes.lines
             np.testing.assert_array_equal(line.get_ydata(), signal[:, 0])
-            np.testing.assert_allclose(line.get_xdata(), 1e3 * SAMPLING_STEP * np.arange(20))
+            np.testing.assert_allclose(line.get_xdata(), 1e3 * SILVERBOX_SAMPLING_STEP * np.arange(20))
             assert axes.get_ylabel() == label
         assert left.get_title(loc="left") == evaluation.policy
         frequencies, sizes = right.lines[0].get_data()
-        tones = np.exp(-2j * np.pi * SAMPLING_STEP * np.outer(frequencies, np.arange(20)))
+        tones = np.exp(-2j * np.pi * SILVERBOX_SAMPLING_STEP * np.outer(frequencies, np.arange(20)))
         power = np.mean(np.abs(tones @ evaluation.inputs / 20) ** 2, axis=1)
         np.testing.assert_allclose(sizes, 1e3 * np.sqrt(power))
-        assert frequencies[-1] == pytest.approx(0.5 / SAMPLING_STEP)
+        assert frequencies[-1] == pytest.approx(0.5 / SILVERBOX_SAMPLING_STEP)
 
 
 @table("updates", [1, 2, 30])

@@ -26,12 +26,12 @@ from agents.policies.efe_planner import EfePlanner
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator import Channel, Rig
 from estimator.belief import Belief, covariance_places
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
-from estimator.parameters import SAMPLING_STEP
 from estimator.priors import silverbox_prior
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 
 def make(track, n, **options):
@@ -295,7 +295,7 @@ def test_it_plays_a_plant_of_ones_own():
 
     gains = {}
     for name in ("efe", "prbs"):
-        rig = Rig(SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
+        rig = Rig(SILVERBOX_SAMPLING_STEP, input=Channel("V", limit=1.0), output=Channel("V", range=1.0))
         own = {"max_input": 0.15, "max_output": 0.6, "prior": silverbox_prior(), "noise_hypotheses": 1}
         env = gym.make("duffing_env/Rig-v0", rig=rig, plant=Plant(), horizon=48, **own)
         policy, state, gains[name] = make_policy(name, env), None, 0.0
@@ -341,7 +341,7 @@ def test_plans_count_on_what_an_input_moves_within_its_sample():
     # An input that goes linearly from the last one acts in full a sample later; rigs keep the whole margin.
     slow = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=0.1, budget=np.inf), model=duffing())
     weak = SimpleNamespace(kernel_params=SimpleNamespace(max_slew=np.inf, budget=1.0), model=duffing())
-    rig = SimpleNamespace(kernel_params=free.kernel_params, model=duffing(), rig=Rig(SAMPLING_STEP))
+    rig = SimpleNamespace(kernel_params=free.kernel_params, model=duffing(), rig=Rig(SILVERBOX_SAMPLING_STEP))
     assert (
         recoverable_step(free, ModelView(duffing(), 1), held)
         == recoverable_step(free, ModelView(difference(), 0, 1), held)

@@ -6,15 +6,15 @@ import pytest
 from scipy import signal, stats
 
 from duffing_env.batch import spawn_seeds
-from estimator import SAMPLING_STEP
+from estimator import SILVERBOX_SAMPLING_STEP
 from estimator.information import cramer_rao, fisher_information
 from estimator.maximum_a_posteriori import maximum_a_posteriori
-from estimator.models.difference import difference
-from estimator.physical import coefficients_of, to_physical
+from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
+from estimator.rigs.physical_parameters import coefficients_of, to_physical
 
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 16, 256
-TIME = SAMPLING_STEP * np.arange(SAMPLES)
+TIME = SILVERBOX_SAMPLING_STEP * np.arange(SAMPLES)
 NOISES = (5e-4, 5e-4)
 MODEL = difference()
 PRIOR = silverbox_prior(MODEL)

@@ -85,7 +85,9 @@ def test_settings_that_make_no_sense_are_refused(words, message, capsys):
 
 
 def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None if name == "ray" else name)
+    monkeypatch.setattr(
+        "estimator.support.optional_dependencies.find_spec", lambda name: None if name == "ray" else name
+    )
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'duffing-env\[ray\]'"):
         list(train_seeds(config(tmp_path), 2, on_ray=True))
 

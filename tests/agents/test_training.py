@@ -234,7 +234,7 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(runs):
 
 
 def test_a_training_in_which_no_episode_ended_says_so(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
+    monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
     settings = {"hyperparameters": TINY, "systems": 0, "reward": "information_gain"}
     TrainCommand(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
     told, said = capsys.readouterr()
@@ -334,7 +334,7 @@ def test_sac_beats_signals_that_do_not_look(tmp_path):
 @pytest.mark.parametrize("begin", [train, lambda config: resume(config.output)], ids=["train", "resume"])
 def test_a_folder_that_another_trains_in_is_refused_untouched(tmp_path, begin):
     (tmp_path / "run").mkdir()
-    holds = "import sys; from pathlib import Path; from estimator.files import hold\n"
+    holds = "import sys; from pathlib import Path; from estimator.support.file_io import hold\n"
     holds += "hold('output', Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     words = [sys.executable, "-c", holds, tmp_path / "run"]
     other = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

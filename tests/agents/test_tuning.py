@@ -121,7 +121,7 @@ def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
 
 
 def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("estimator.support.optional_dependencies.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"optuna is not installed; get it with: pip install .*\[tune\]"):
         tune_hyperparameters(tiny(tmp_path / "search"), 2)
     assert not (tmp_path / "search").exists()

@@ -28,7 +28,7 @@ from agents.training import TrainConfig, resume, train
 from agents.training.algorithms import ALGORITHMS
 from agents.training.checkpoints import latest_checkpoint
 from estimator import Rig
-from estimator.identification.tables import read_table
+from estimator.identification.data.text_tables import read_table
 from research.studies import ship_policy
 
 resource = pytest.importorskip("resource", reason="this system has no limits of the size of files")

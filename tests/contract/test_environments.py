@@ -20,7 +20,7 @@ from playing import (
 )
 from specimens import COMPILED, ENVIRONMENTS, VECTORS, each
 
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
 
 FLAGS = {"diverged", "off_record"}
 

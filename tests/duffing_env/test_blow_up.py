@@ -6,13 +6,13 @@ import pytest
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.rewards.reward_registry import REWARDS
-from estimator import SAMPLING_STEP
+from estimator import SILVERBOX_SAMPLING_STEP
 
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 8, 256
 LEARNABLE = [name for name in REWARDS if name != "free_energy"]  # the foil rewards what is known already
 LIMITS = STANDARD, RAISED, NONE = 0.6, 1e3, 1e300
 WORTH = -10.0
-TIME = SAMPLING_STEP * np.arange(SAMPLES)
+TIME = SILVERBOX_SAMPLING_STEP * np.arange(SAMPLES)
 
 
 def bank():

@@ -13,7 +13,7 @@ from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
-from estimator import CONTINUOUS_TWIN, SAMPLING_STEP
+from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP
 from estimator.lanes import LANES
 from estimator.models.duffing import duffing
 
@@ -30,7 +30,7 @@ def lanes(seed=0, **rows):
     by_row = np.zeros((max(PLACE.values()) + 1, LANES))
     words = np.random.default_rng(seed).integers(1, 2**63, (4, LANES), dtype=np.uint64)
     rows = dict(zip(STREAM, words.view(np.float64), strict=True)) | rows
-    rows = dict(zip(RATES, to_rates(CONTINUOUS_TWIN), strict=True)) | rows
+    rows = dict(zip(RATES, to_rates(SILVERBOX_ODE_TWIN), strict=True)) | rows
     for name, values in rows.items():
         by_row[PLACE[name]] = values
     return by_row
@@ -58,18 +58,18 @@ def test_the_drift_is_eq_1_to_far_below_the_noise():
     last_u, u = rng.uniform(-0.15, 0.15, (2, LANES))
     by_row = lanes(X_x=x, X_v=v, LAST_INPUT=last_u, RISE=u - last_u)
     step(by_row)
-    twin = CONTINUOUS_TWIN
+    twin = SILVERBOX_ODE_TWIN
     for j in range(LANES):
 
         def slope(t, state, j=j):
-            force = last_u[j] + (u[j] - last_u[j]) * t / SAMPLING_STEP
+            force = last_u[j] + (u[j] - last_u[j]) * t / SILVERBOX_SAMPLING_STEP
             return [state[1], (force - twin.c * state[1] - twin.a * state[0] - twin.b * state[0] ** 3) / twin.m]
 
-        start = [x[j], v[j] / SAMPLING_STEP]
-        exact = solve_ivp(slope, (0, SAMPLING_STEP), start, rtol=1e-12, atol=1e-12).y[:, -1]
+        start = [x[j], v[j] / SILVERBOX_SAMPLING_STEP]
+        exact = solve_ivp(slope, (0, SILVERBOX_SAMPLING_STEP), start, rtol=1e-12, atol=1e-12).y[:, -1]
         # The smallest noise of docs/continuous.md moves x by 1e-4 V and x' by 1.7e-4 V per sample.
         assert by_row[PLACE["X_x"], j] == pytest.approx(exact[0], abs=1e-6)
-        assert by_row[PLACE["X_v"], j] == pytest.approx(exact[1] * SAMPLING_STEP, abs=4e-6)
+        assert by_row[PLACE["X_v"], j] == pytest.approx(exact[1] * SILVERBOX_SAMPLING_STEP, abs=4e-6)
     np.testing.assert_array_equal(by_row[PLACE["Y_y"]], by_row[PLACE["X_x"]])
 
 
@@ -79,7 +79,7 @@ def test_a_constant_input_ends_where_the_spring_holds_it():
     for _ in range(1000):
         step(by_row)
     x = by_row[PLACE["X_x"]]
-    np.testing.assert_allclose(CONTINUOUS_TWIN.a * x + CONTINUOUS_TWIN.b * x**3, u, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(SILVERBOX_ODE_TWIN.a * x + SILVERBOX_ODE_TWIN.b * x**3, u, rtol=0, atol=1e-12)
 
 
 def test_it_does_not_blow_up():
@@ -112,7 +112,7 @@ def noise_of_a_sample(draws, kind=KIND, **rows):
 def test_the_noise_is_what_the_estimator_takes_it_for(x):
     # 64,000 draws: variances to 0.6 % (one standard deviation).
     measured = np.cov(noise_of_a_sample(2000, X_x=x))
-    _, _, expected = continuous_step(np.array([x, 0.0, *to_rates(CONTINUOUS_TWIN)]), 0.0, 0.0)
+    _, _, expected = continuous_step(np.array([x, 0.0, *to_rates(SILVERBOX_ODE_TWIN)]), 0.0, 0.0)
     np.testing.assert_allclose(measured, expected, rtol=0.03)
     # Weaker than of a free mass, which would have 1, 3/2, 3.
     assert measured[0, 0] < 0.95

@@ -12,8 +12,8 @@ from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import compile_unpacker, pack_params
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from duffing_env.tracks.silverbox_replay import ReplayExperiment
-from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN
-from estimator.models.difference import difference
+from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.priors import log_uniform_moments, published_run_prior, weak_prior
 
@@ -112,7 +112,7 @@ def test_settings_are_the_options():
     expected = {
         "iterations": 4, "has_drift": False, "jump": 0.0, "terminal": False, "has_terminated_return": False,
         "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
-        "input_delay": 0, "as_published": False, "step": SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
+        "input_delay": 0, "as_published": False, "step": SILVERBOX_SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
     }  # fmt: skip
     assert {name: getattr(setup, name) for name in expected} == expected
     assert setup.measurement_noise.tolist() == [2e-3]
@@ -163,14 +163,14 @@ def test_a_continuous_experiment_is_told_of_its_estimator():
         duffing(),
         0,
     )
-    assert ode.kernel_params.nominal_parameters.tolist() == [getattr(CONTINUOUS_TWIN, name) for name in "mcab"]
-    assert ode.prior_belief == prior_of(duffing(), CONTINUOUS_TWIN, **options)
+    assert ode.kernel_params.nominal_parameters.tolist() == [getattr(SILVERBOX_ODE_TWIN, name) for name in "mcab"]
+    assert ode.prior_belief == prior_of(duffing(), SILVERBOX_ODE_TWIN, **options)
     for factorisation in ("structured", "mean_field"):
         nlarx = ContinuousExperiment(estimator="nlarx", factorisation=factorisation, **options)
         assert (nlarx.kernel_spec.plant_model, nlarx.kernel_spec.belief_model) == (duffing(), difference())
         assert nlarx.kernel_spec.factorisation == factorisation
         # Oscillators are drawn about the continuous twin, and so is what the difference equation expects.
-        assert nlarx.prior_belief == prior_of(difference(), CONTINUOUS_TWIN, **options, factorisation=factorisation)
+        assert nlarx.prior_belief == prior_of(difference(), SILVERBOX_ODE_TWIN, **options, factorisation=factorisation)
 
 
 def test_an_unknown_estimator_is_named():

@@ -16,8 +16,8 @@ from duffing_env.kernel import RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.rewards.reward_registry import REWARDS
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator import SILVERBOX_TWIN
-from estimator.models.difference import difference
-from estimator.physical import coefficients_of
+from estimator.models.difference_equation import difference
+from estimator.rigs.physical_parameters import coefficients_of
 
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])

@@ -7,11 +7,11 @@ from reference.filters import Plant, moved
 from specimens import COMPILED, SEEN_TWICE
 
 from duffing_env.tracks.model_env import ModelEnv, ModelExperiment
-from estimator.models.pendulum import PENDULUM, STEP
-from estimator.parameters import Parameters
-from estimator.physical import coefficients_of
+from estimator.models.pendulum import PENDULUM, PENDULUM_SAMPLING_STEP
 from estimator.priors import log_uniform_moments
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.units import Scales
+from estimator.support.array_types import Parameters
 
 (OWN,) = (environment for environment in COMPILED if environment.name == "own model")
 PENDULA = {"p1": 14.7, "p2": 0.5, "p3": 3.0}
@@ -70,9 +70,11 @@ def test_it_is_played_and_believed():
 
 
 def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
-    experiment = ModelExperiment(system="pendulum", mean=PENDULA, spread=0.2, sampling_step=STEP, sensor_noise=[0.01])
+    experiment = ModelExperiment(
+        system="pendulum", mean=PENDULA, spread=0.2, sampling_step=PENDULUM_SAMPLING_STEP, sensor_noise=[0.01]
+    )
     belief = experiment.prior_belief
-    mean, cov = log_uniform_moments(PENDULUM, PENDULA, 0.2, Scales(STEP))
+    mean, cov = log_uniform_moments(PENDULUM, PENDULA, 0.2, Scales(PENDULUM_SAMPLING_STEP))
     np.testing.assert_array_equal(belief.coefficients_mean, mean)
     np.testing.assert_array_equal(belief.coefficients_cov, cov)
     assert belief.noises[2:] == pytest.approx([2.0, 2.0 * 5e-4**2, 2.0, 2.0 * 0.01**2])

@@ -10,10 +10,10 @@ from specimens import all_that_is_given
 from duffing_env.custom_functions import Beliefs
 from duffing_env.env import DuffingEnv
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.models.difference import difference
-from estimator.physical import coefficients_of
+from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.units import Scales
 
 PARAMETERS = ("m", "c", "a", "b")
 

@@ -21,8 +21,8 @@ from duffing_env.rendering import episode_renderer
 from duffing_env.rendering.episode_renderer import HEIGHT, MAX_SAMPLES_SHOWN, WIDTH, EpisodeRenderer
 from duffing_env.tracks.model_env import ModelExperiment
 from estimator.engine.rows import belief_names
-from estimator.parameters import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.priors import silverbox_prior
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 
 PRIOR = silverbox_prior()
 
@@ -116,7 +116,7 @@ def test_curves_and_numbers_are_those_of_the_episode():
     for row, unit in enumerate((1e-6, 1e-4, 1, 1)):
         panel = panel_of(screen, row)
         times, percent = panel.mean.get_data()
-        np.testing.assert_allclose(times, np.arange(21) * SAMPLING_STEP * 1e3)
+        np.testing.assert_allclose(times, np.arange(21) * SILVERBOX_SAMPLING_STEP * 1e3)
         np.testing.assert_allclose(percent, 100 * (mean[:, row] / truth[row] - 1), atol=1e-9)
         band = panel.band.get_paths()[0].vertices
         upper = np.clip(100 * ((mean + half)[:, row] / truth[row] - 1), -150, 150)
@@ -199,7 +199,7 @@ def test_an_episode_without_a_usable_belief_is_drawn():
 def test_long_episodes_scroll():
     screen = with_samples(MAX_SAMPLES_SHOWN + 44, horizon=1000)
     times = panel_of(screen, 0).mean.get_xdata()
-    np.testing.assert_allclose(times[[0, -1]], np.array([44, MAX_SAMPLES_SHOWN + 44]) * SAMPLING_STEP * 1e3)
+    np.testing.assert_allclose(times[[0, -1]], np.array([44, MAX_SAMPLES_SHOWN + 44]) * SILVERBOX_SAMPLING_STEP * 1e3)
     low, high = screen._figure_cache._panels[0].axes.get_xlim()
     assert low < times[0] < times[-1] < high
     assert high - low < 1.05 * (times[-1] - times[0])
@@ -208,7 +208,9 @@ def test_long_episodes_scroll():
 def test_time_axes_reach_over_short_episodes():
     screen = with_samples(1, horizon=40)
     screen.frame()
-    assert screen._figure_cache._panels[0].axes.get_xlim()[1] == pytest.approx(40 * SAMPLING_STEP * 1e3, rel=0.02)
+    assert screen._figure_cache._panels[0].axes.get_xlim()[1] == pytest.approx(
+        40 * SILVERBOX_SAMPLING_STEP * 1e3, rel=0.02
+    )
 
 
 def test_frames_hold_nothing_of_earlier_frames_and_episodes():

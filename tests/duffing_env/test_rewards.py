@@ -12,11 +12,11 @@ from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import pay_reward
 from duffing_env.rewards.reward_registry import REWARDS, check_reward
 from duffing_env.storage.kernel_spec import block_layout
-from estimator import SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief
 from estimator.engine.rows import belief_names
 from estimator.lanes import LANES, lanewise
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
 
 PARAMETERS = ("m", "c", "a", "b")
@@ -61,7 +61,7 @@ class Lanes:
         for name in self.model.physical:
             self[f"PARAM_{name}"][:] = getattr(truth, name)
         for lane in range(LANES):
-            self.code.settle_truth(self.rows.reshape(-1), lane, SAMPLING_STEP)
+            self.code.settle_truth(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
 
     def set_coefficients(self, mean, cov):
         names = [COEFFICIENTS[k] for k in self.active]
@@ -72,12 +72,12 @@ class Lanes:
 
     def appraise(self):
         for lane in range(LANES):
-            self.code.appraise(self.rows.reshape(-1), lane, SAMPLING_STEP)
+            self.code.appraise(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
 
     def settle(self, input_cost=0.0, terminal=False, terminated_return=None):
         weights = REWARDS[self.reward].weights
         price = np.sqrt(input_cost)
-        self.code.settle(self.rows.reshape(-1), SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
+        self.code.settle(self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
             payer(self.kernel_spec)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)

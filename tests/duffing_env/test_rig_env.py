@@ -11,7 +11,7 @@ from specimens import RIG, Bench
 from agents import make_policy
 from duffing_env.tracks.rig_env import RigExperiment
 from estimator import OnlineEstimator, Rig
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
 
 GUESS = RIG.guess
 ID = "duffing_env/Rig-v0"

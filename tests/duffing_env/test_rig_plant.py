@@ -18,10 +18,10 @@ from duffing_env.rewards.reward_registry import REWARDS
 from duffing_env.tracks.rig_env import RigEnv
 from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import Belief
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.pendulum import PENDULUM
 from estimator.priors import silverbox_prior, weak_prior
-from estimator.rig_prior import begun_again, rig_prior
+from estimator.rigs.rig_prior import reset_state, rig_prior
 
 GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
 
@@ -222,14 +222,14 @@ def test_an_episode_does_not_begin_where_the_record_of_its_prior_ended():
     mean[:2], cov[:2], cov[:, :2] = (0.4, -0.2), 0.0, 0.0
     cov[0, 0] = cov[1, 1] = 1e-8
     ended = Belief.of(prior.model, mean, cov, prior.noises[:2], prior.noises[2:], scales=prior.scales)
-    np.testing.assert_allclose(begun_again(ended).record, prior.record, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(reset_state(ended).record, prior.record, rtol=1e-9, atol=1e-15)
     # As tests/specimens.py has it: with hypotheses.
     env = around(Difference(), prior=ended, reward="information_gain", noise_hypotheses=3)
     env.reset()
     np.testing.assert_allclose(env.belief.state_mean, prior.state_mean)
     np.testing.assert_allclose(env.belief.state_cov, prior.state_cov)
     outputs = silverbox_prior(difference())
-    assert begun_again(outputs) is outputs, "its states are outputs"
+    assert reset_state(outputs) is outputs, "its states are outputs"
 
 
 def test_the_noises_are_as_likely_at_first_as_to_the_estimator_of_the_rig():

@@ -5,7 +5,7 @@ import numpy as np
 from twin import PARAMETERS, TwinContinuousEnv, TwinEnv, multisine
 
 from duffing_env.rewards.simulation_error_reward import TEST_INPUT
-from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN, Parameters
+from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN, Parameters
 
 SPREAD = 0.3
 
@@ -33,7 +33,7 @@ def test_the_test_input_is_a_schroeder_multisine():
 def test_no_oscillator_comes_near_its_limit():
     difference, continuous = TwinEnv(0), TwinContinuousEnv(0)
     peaks = []
-    for center, twin in ((SILVERBOX_TWIN, difference), (CONTINUOUS_TWIN, continuous)):
+    for center, twin in ((SILVERBOX_TWIN, difference), (SILVERBOX_ODE_TWIN, continuous)):
         for truth in corners(center):
             peaks.append(np.abs(twin.free_run(twin.to_coefficients(truth))).max())
     assert 0.2 < np.median(peaks) < max(peaks) < 0.4

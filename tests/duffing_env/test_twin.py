@@ -3,7 +3,7 @@
 import pytest
 
 from duffing_env.plants.silverbox_twin import identify_continuous_twin, identify_difference_twin
-from estimator import CONTINUOUS_TWIN, SILVERBOX_TWIN
+from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN
 
 PARAMETERS = ("m", "c", "a", "b")
 
@@ -19,4 +19,4 @@ def test_the_continuous_twin_is_identified_from_the_record(record):
     found = identify_continuous_twin(record)
     # The constants are those of the tracks and stay. Since they were identified the estimator weighs the two noises a
     # little otherwise, which on this record, no oscillator of Eq. (1), moves the cubic term by 4e-4 of it.
-    assert dict(found) == pytest.approx(dict(CONTINUOUS_TWIN), rel=5e-4)
+    assert dict(found) == pytest.approx(dict(SILVERBOX_ODE_TWIN), rel=5e-4)

@@ -14,8 +14,8 @@ from reference.mean_field import LOG_2PI, mean_field_step
 from reference.structured import structured_update
 from rounding import U32
 
-from estimator import CONTINUOUS_TWIN, SAMPLING_STEP, SILVERBOX_TWIN, Parameters
-from estimator.models.difference import difference
+from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.priors import log_uniform_moments, weak_prior
 
@@ -55,26 +55,26 @@ class Moments(reference.mean_field.Moments):
 def to_coefficients(truth):
     """(4,) θ1, θ2, θ3 and η of an oscillator, Eqs. (3) and (4)."""
     m, c, a, b = (getattr(truth, name) for name in PARAMETERS)
-    d = SAMPLING_STEP
+    d = SILVERBOX_SAMPLING_STEP
     return np.array([2 * m + c * d - a * d**2, -b * d**2, -m, d**2]) / (m + c * d)
 
 
 def to_parameters(coefficients):
     """(4,) m, c, a and b of them."""
     t1, t2, t3, e = coefficients
-    return np.array([-t3 * SAMPLING_STEP**2, (1 + t3) * SAMPLING_STEP, 1 - t1 - t3, -t2]) / e
+    return np.array([-t3 * SILVERBOX_SAMPLING_STEP**2, (1 + t3) * SILVERBOX_SAMPLING_STEP, 1 - t1 - t3, -t2]) / e
 
 
 def to_rates(truth):
     """(4,) stiffness, cubic, damping and gain of an oscillator, with time counted in samples."""
     m, c, a, b = (getattr(truth, name) for name in PARAMETERS)
-    return np.array([a, b, c / SAMPLING_STEP, 1.0]) * SAMPLING_STEP**2 / m
+    return np.array([a, b, c / SILVERBOX_SAMPLING_STEP, 1.0]) * SILVERBOX_SAMPLING_STEP**2 / m
 
 
 def from_rates(coefficients):
     """(4,) m, c, a and b of them."""
     stiffness, cubic, damping, gain = coefficients
-    return np.array([SAMPLING_STEP**2, SAMPLING_STEP * damping, stiffness, cubic]) / gain
+    return np.array([SILVERBOX_SAMPLING_STEP**2, SILVERBOX_SAMPLING_STEP * damping, stiffness, cubic]) / gain
 
 
 def log_det(cov):
@@ -296,7 +296,7 @@ class TwinEnv:
 class TwinContinuousEnv(TwinEnv):
     """One experiment on the differential equation, from the docstring of `ContinuousEnv`."""
 
-    center = CONTINUOUS_TWIN
+    center = SILVERBOX_ODE_TWIN
 
     def __init__(self, seed, *, estimator="ode", **options):
         self.estimator = estimator

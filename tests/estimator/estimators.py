@@ -4,7 +4,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Parameters, Rig, coefficients_of, difference, duffing
-from estimator.models.difference import Term
+from estimator.models.difference_equation import Term
 from estimator.models.pendulum import PENDULUM
 from estimator.priors import weak_prior
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from estimator import Channel, Rig
 from estimator.free_run import free_run
-from estimator.models.duffing import KINDS, duffing
-from estimator.physical import coefficients_of
-from estimator.units import Scales
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.units import Scales
 
 #: A bench of 0.4 kg at 1 kHz, and a softening oscillator at 200 Hz: truth, step, amplitude, sensor noise, and samples
 #: that the input is held for.
@@ -29,7 +29,7 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start
     rng = np.random.default_rng(seed)
     u = amplitude * np.repeat(rng.choice([-1.0, 1.0], samples // hold), hold)
     model = duffing(offsets=True, sensor=kind)
-    scales = Scales(step, amplitude, 1e-2, KINDS[kind])
+    scales = Scales(step, amplitude, 1e-2, DERIVATIVE_ORDER_OF_SENSOR[kind])
     known = {p: truth.get(p, 0.0) for p in model.physical}
     disturbed = u / amplitude + force * rng.standard_normal(samples)
     state = [start / scales.displacement, 0.0]
@@ -41,7 +41,10 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start
 
 def struck(blows, rate, kind, lasting, seconds=2.0):
     """Rig and record of a bench of 0.35 kg that blows (times) strike which last so long [s]."""
-    truth, scales = {"m": 0.35, "c": 0.8, "a": 1800.0, "b": 3e7}, Scales(1 / rate, 100.0, 1e-2, KINDS[kind])
+    truth, scales = (
+        {"m": 0.35, "c": 0.8, "a": 1800.0, "b": 3e7},
+        Scales(1 / rate, 100.0, 1e-2, DERIVATIVE_ORDER_OF_SENSOR[kind]),
+    )
     times, u = np.arange(int(seconds * rate)) / rate, np.zeros(int(seconds * rate))
     for begin in blows:
         inside = (times > begin) & (times < begin + lasting)

@@ -32,9 +32,9 @@ def test_the_way_of_the_input_that_a_check_advised_is_judged_again(tmp_path, cas
 def test_two_amplitudes_of_a_sine_tell_what_one_leaves_open(tmp_path):
     one, other = (Case("settled_sine", {"part": 0.8, "size": size}, "", seed=4).make() for size in (0.3, 0.9))
     both = replace(one, files={"one.csv": one.files["r.csv"], "other.csv": other.files["r.csv"]})
-    assert next(answered(one, tmp_path))[1].open == ("m", "a", "b")
+    assert next(answered(one, tmp_path))[1].unidentified == ("m", "a", "b")
     verdict, result = next(answered(both, tmp_path))
-    assert (verdict, result.open) == ("right", ())
+    assert (verdict, result.unidentified) == ("right", ())
 
 
 def test_the_manual_has_the_answer_to_every_case():

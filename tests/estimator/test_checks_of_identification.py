@@ -9,8 +9,8 @@ import pytest
 from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
-from estimator.identification.checks import _of_blows, _of_outliers
-from estimator.identification.records import Record
+from estimator.identification.data.record_reader import Record
+from estimator.identification.diagnostics.validity_checks import _check_outliers, _check_short_impacts
 
 GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
 
@@ -42,11 +42,11 @@ def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
     y = np.exp(-k / 15) * np.cos(2 * np.pi * k / 5) + 1e-4 * np.random.default_rng(0).standard_normal(len(k))
     assert np.abs(y).max() > 20 * np.quantile(np.abs(y), 0.99)
     struck = Record("struck", np.zeros(4000), np.concatenate([y[:1000] * 1e-4, y[:3000]]))
-    assert _of_outliers(Channel("m"), [struck]) == []
+    assert _check_outliers(Channel("m"), [struck]) == []
     struck.y[50] = 30.0
-    (found,) = _of_outliers(Channel("m"), [struck])
+    (found,) = _check_outliers(Channel("m"), [struck])
     assert found.message.startswith("1 output stands alone, far off all others: sample 50 of struck is 30 m")
-    assert _of_outliers(Channel("m/s²", kind="acceleration"), [struck]) == []
+    assert _check_outliers(Channel("m/s²", kind="acceleration"), [struck]) == []
 
 
 @pytest.mark.parametrize("late", [4, 12, 24, 45])
@@ -185,13 +185,13 @@ def test_blows_that_few_samples_see_are_named(rate, named):
 def test_short_steps_that_a_converter_held_are_no_blows():
     _, rig, (u, y) = struck((0.1, 0.9), 1e3, "displacement", 4e-3)
     held = [Record("held", np.where(np.abs(u) > 0, 100.0, 0.0), y)]
-    assert _of_blows(replace(rig, interpolation="zero_order"), held) == []
-    assert [one.name for one in _of_blows(rig, held)] == ["short_blows"]
+    assert _check_short_impacts(replace(rig, interpolation="zero_order"), held) == []
+    assert [one.name for one in _check_short_impacts(rig, held)] == ["short_blows"]
 
 
 def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
     record = simulated(WELLS, 7, 1024, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
-    monkeypatch.setattr(sys.modules["estimator.identification.search"], "_TRIES", 0)
+    monkeypatch.setattr(sys.modules["estimator.identification.fitting.multistart_search"], "_TRIES", 0)
     (warning,) = identify(rig_of(WELLS, "acceleration"), record).warnings
     assert warning.name == "search_failed"
     assert "the search may have failed" in warning.message

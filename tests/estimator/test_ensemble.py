@@ -13,7 +13,7 @@ from estimator.belief import Belief
 from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
 from estimator.inference.mixture import SWITCHING, foretell, leave_out, mixing, switch, weigh
 from estimator.lanes import LANES
-from estimator.rig_prior import rig_prior
+from estimator.rigs.rig_prior import rig_prior
 
 RATIOS = 5
 MODELS = {

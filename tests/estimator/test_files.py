@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tables import table
 
-from estimator.files import append_atomically, check_place, write_atomically
+from estimator.support.file_io import append_atomically, check_writable, write_atomically
 
 
 def names(folder):
@@ -122,7 +122,7 @@ def test_a_link_is_followed_and_a_mode_is_kept(tmp_path, write):
 def test_a_place_that_can_be_written_is_left_as_it_was(tmp_path):
     (tmp_path / "file").write_text("old")
     for place in (tmp_path, tmp_path / "file", tmp_path / "new", tmp_path / "on the way" / "to" / "new"):
-        check_place(place)
+        check_writable(place)
     assert names(tmp_path) == ["file"]
     assert (tmp_path / "file").read_text() == "old"
 
@@ -133,7 +133,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_it_is(tmp_path, monkey
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path / "file", tmp_path / "pipe", tmp_path / "pipe" / "new"):
         with pytest.raises(OSError, match="name another place"):
-            check_place(place)
+            check_writable(place)
 
     def refuse(dir):
         raise PermissionError(13, "Permission denied", f"{dir}/a temporary name")
@@ -141,6 +141,6 @@ def test_a_place_that_cannot_be_written_is_refused_before_it_is(tmp_path, monkey
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     for place in (tmp_path, tmp_path / "new", tmp_path / "on the way" / "new"):
         with pytest.raises(PermissionError) as told:
-            check_place(place)
+            check_writable(place)
         message = "[Errno 13] Permission denied; allow to write there, or name another place"
         assert str(told.value) == f"{message}: '{place}'"

@@ -8,13 +8,17 @@ from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struc
 
 from estimator import Channel, Rig, identify
 from estimator.free_run import free_run
-from estimator.identification.fit import Hypothesis
-from estimator.identification.motions import motions
-from estimator.identification.problem import LATEST, Problem, explicable
-from estimator.models.duffing import KINDS, duffing
-from estimator.physical import coefficients_of
-from estimator.rig_prior import about
-from estimator.units import Scales
+from estimator.identification.likelihood.identification_problem import (
+    MAX_UNSTATED_DELAY,
+    IdentificationProblem,
+    mask_unexplained_outputs,
+)
+from estimator.identification.likelihood.initial_states import find_initial_states
+from estimator.identification.likelihood.laplace_fit import FitHypothesis
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.rig_prior import belief_from_moments
+from estimator.rigs.units import Scales
 
 GUESS = {name: (0.7 * value, 1.4 * value) for name, value in BENCH[0].items()}
 
@@ -79,7 +83,7 @@ def test_gaps_clipped_samples_and_several_records():
     assert [one.missing for one in result.records] == [30, 0, 0, 0]
     assert [len(one.y) for one in result.records] == [2048, 1000, 1047, 2048]
     assert [one.name for one in result.records] == ["record 0", "record 1", "record 1, from sample 1001", "record 2"]
-    assert result.records[3].clipped == (np.abs(far) >= stop).sum()
+    assert result.records[3].n_clipped == (np.abs(far) >= stop).sum()
     assert [warning.name for warning in result.warnings] == ["clipped"]
     assert np.abs(deviations(result, BENCH[0])).max() < 5
 
@@ -101,16 +105,16 @@ def test_what_few_samples_tell_is_a_covariance_in_spite_of_rounding():
     """Two offsets that show as one leave a covariance that is symmetric to nine digits."""
     u, y = simulated(SOFT)
     rig = rig_of(SOFT)
-    problem = Problem(rig, rig.scales, (u,), (y,))
+    problem = IdentificationProblem(rig, rig.scales, (u,), (y,))
     std = np.array([1e-3, 1e-2, 1e-4, 5e-2, 5e-2, 1e-1])
     shape = np.eye(6)
     shape[3, 4], shape[4, 3] = -1.0 + 1e-9, -1.0 + 1e-9 + 4e-9
-    mean, cov = problem.outward(np.array([0.1, 0.2, 0.3, 0.4, 0.0, 0.0]), np.outer(std, std) * shape)
+    mean, cov = problem.moments_about_zero(np.array([0.1, 0.2, 0.3, 0.4, 0.0, 0.0]), np.outer(std, std) * shape)
     np.testing.assert_array_equal(cov, cov.T)
-    assert about(rig, rig.scales, mean, cov).coefficients()
+    assert belief_from_moments(rig, rig.scales, mean, cov).coefficients()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DERIVATIVE_ORDER_OF_SENSOR)
 def test_the_motion_before_each_record_is_found(kind):
     truth, step, amplitude, _, hold = SOFT
     places = np.array([200, 501, 777])
@@ -118,7 +122,7 @@ def test_the_motion_before_each_record_is_found(kind):
     u[places - 1] = 0.0  # a record does not tell what acts while its first output comes about
     shown = {}
     for sensor in ("displacement", "velocity", kind):
-        scales = Scales(step, amplitude, 1e-2, KINDS[sensor])
+        scales = Scales(step, amplitude, 1e-2, DERIVATIVE_ORDER_OF_SENSOR[sensor])
         model = duffing(offsets=True, sensor=sensor)
         known = coefficients_of(model, {p: truth.get(p, 0.0) for p in model.physical}, scales)
         shown[sensor] = np.concatenate([[0.0], free_run(model, known, u / amplitude)[:-1]])
@@ -127,20 +131,22 @@ def test_the_motion_before_each_record_is_found(kind):
     v = shown["velocity"] * Scales(step, amplitude, 1e-2, 1).displacement / scales.displacement
     rig = rig_of(SOFT, kind)
     pieces = [slice(k, k + 100) for k in places]
-    problem = Problem(
+    problem = IdentificationProblem(
         rig,
         scales,
         tuple(u[p] / amplitude for p in pieces),
-        tuple(explicable(shown[kind][p], rig) for p in pieces),
+        tuple(mask_unexplained_outputs(shown[kind][p], rig) for p in pieces),
     )
     assert problem.model.digest == replace(model, substeps=2).digest
     level = 1e-4 * np.abs(shown[kind]).max()
     other = 0.9 * known
-    found, beside = motions(problem, Hypothesis("zero_order", 0, 0.1), np.array([known, other]), level)
+    found, beside = find_initial_states(problem, FitHypothesis("zero_order", 0, 0.1), np.array([known, other]), level)
     size = np.array([np.abs(unit * shown["displacement"]).max(), np.abs(v).max()])
     expected = np.stack([unit * shown["displacement"][places - 1], v[places - 1]], axis=1)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-3)
-    np.testing.assert_array_equal(beside, motions(problem, Hypothesis("zero_order", 0, 0.1), other[None], level)[0])
+    np.testing.assert_array_equal(
+        beside, find_initial_states(problem, FitHypothesis("zero_order", 0, 0.1), other[None], level)[0]
+    )
 
 
 def test_the_result_goes_on(tmp_path, bench):
@@ -151,7 +157,7 @@ def test_the_result_goes_on(tmp_path, bench):
     inside = np.abs(y - forecast[:, 0])[5:] < 1.645 * np.sqrt(forecast[5:, 1])
     assert 0.87 < inside.mean() < 0.93
     counts, told = zip(*result.history, strict=True)
-    assert counts == tuple(count - LATEST for count in (64, 128, 256, 512, 1024, 2048))
+    assert counts == tuple(count - MAX_UNSTATED_DELAY for count in (64, 128, 256, 512, 1024, 2048))
     assert told[-1] == result.parameters
     for name in BENCH[0]:
         stds = np.array([one[name][1] for one in told])
@@ -280,10 +286,10 @@ def test_a_settled_sine_leaves_mass_and_stiffness_open_and_gives_the_damping(amp
     assert result.ridges is not None
     wide = result.interval(0.99)
     for name, true in GENTLE.items():
-        assert name in result.open or wide[name][0] < true < wide[name][1], name
+        assert name in result.unidentified or wide[name][0] < true < wide[name][1], name
     assert {one.name for one in result.warnings} <= {"not_identified"}
     mean, std = result.parameters["c"]
-    assert "c" not in result.open
+    assert "c" not in result.unidentified
     assert abs(mean - GENTLE["c"]) < 4 * std < 0.05 * GENTLE["c"]
     # What goes on from here knows it, too.
     believed, spread, _ = result.belief.parameters()["m"]
@@ -303,4 +309,4 @@ def test_intervals_along_a_ridge_hold_more_with_a_larger_probability():
     narrow, wide = result.interval(0.5), result.interval(0.95)
     assert all(wide[p][0] < narrow[p][0] < narrow[p][1] < wide[p][1] for p in wide)
     assert "m = " in str(result)
-    assert all("], open" in line for line in str(result).splitlines() if line.strip()[:1] in result.open)
+    assert all("], open" in line for line in str(result).splitlines() if line.strip()[:1] in result.unidentified)

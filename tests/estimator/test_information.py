@@ -8,7 +8,7 @@ from tables import table
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
 from estimator.information import cramer_rao, fisher_information, follow, relative_covariance, sampled
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
 
 Q, R = 5e-4, 3e-4
 PAPER = difference()

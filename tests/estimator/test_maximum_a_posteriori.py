@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from estimator import SILVERBOX_TWIN, difference, silverbox_prior, weak_prior
 from estimator.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.pendulum import PENDULUM
-from estimator.physical import coefficients_of
+from estimator.rigs.physical_parameters import coefficients_of
 
 PAPER = difference()
 NOISES = (5e-4, 5e-4)

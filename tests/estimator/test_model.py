@@ -9,10 +9,10 @@ from tables import table
 from estimator.engine.derive import calculus, symbol
 from estimator.free_run import free_run
 from estimator.information import fisher_information
-from estimator.models.difference import Term, difference
+from estimator.models.difference_equation import Term, difference
 from estimator.models.model import Model
-from estimator.physical import coefficients_of, propagate
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of, propagate_to_physical
+from estimator.rigs.units import Scales
 
 TANK = {
     "name": "tank", "states": {"x": "V"}, "coefficients": {"loss": "1"}, "noise": ("1",), "outputs": {"y": "x"},
@@ -140,5 +140,5 @@ def test_parameters_may_be_magnitudes():
     model = Model(**{**TANK, **given})
     scales = Scales(0.01, 1.0, 1.0)
     assert coefficients_of(model, {"t": 0.05}, scales) == pytest.approx([0.2])
-    mean, cov = propagate(model, np.array([0.2]), np.array([[1e-6]]), scales)
+    mean, cov = propagate_to_physical(model, np.array([0.2]), np.array([[1e-6]]), scales)
     assert (mean[0], cov[0, 0]) == pytest.approx((0.05, (0.05 * 1e-3 / 0.2) ** 2))

@@ -52,7 +52,7 @@ def test_run_is_repeated_update(kind, samples, monkeypatch, capsys):
             forecasts.extend(single.forecasts)
     in_parts = [parts.run(u[a:b], y[a:b]) for a, b in ((0, 1), (1, 2), (2, 50), (50, 50), (50, 120))]
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
-    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
+    monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
     np.testing.assert_array_equal(shown.run(u, y, progress=True), free_energies)
     np.testing.assert_array_equal(each, free_energies)
     np.testing.assert_array_equal(forecasts, whole.forecasts)
@@ -298,7 +298,7 @@ def test_spline_takes_records_and_no_samples(samples, monkeypatch):
         estimator.update(u[0], y[0])
     assert estimator.run(u, y).shape == (300, 2)
     monkeypatch.setattr("estimator.online._SAMPLES_BETWEEN_REPORTS", 70)
-    monkeypatch.setattr("estimator.progress.EVERY", 0.0)
+    monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
     shown.run(u, y, progress=True)  # in one piece: a spline through a part of the record is another one
     assert_same(estimator, shown)
 

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import table
 
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
-from estimator.parameters import CONTINUOUS_TWIN, SAMPLING_STEP, Parameters
-from estimator.physical import coefficients_of, physical_slopes, propagate, to_physical
-from estimator.units import Scales
+from estimator.rigs.physical_parameters import coefficients_of, physical_jacobian, propagate_to_physical, to_physical
+from estimator.rigs.units import Scales
+from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, Parameters
 
 EPS = np.finfo(float).eps
 PAPER = difference()
@@ -46,7 +46,7 @@ def vector(model, parameters):
 
 
 def test_sampling_step_is_that_of_the_record():
-    assert pytest.approx(610.3515625, rel=1e-15) == 1 / SAMPLING_STEP
+    assert pytest.approx(610.3515625, rel=1e-15) == 1 / SILVERBOX_SAMPLING_STEP
 
 
 def test_hand_computed_example():
@@ -60,13 +60,13 @@ def test_coefficients_solve_the_difference_equation():
     x_before, x, u, p = 0.03, 0.05, 0.2, OSCILLATOR
     theta1, theta2, theta3, eta = coefficients_of(PAPER, p)
     x_after = theta1 * x + theta2 * x**3 + theta3 * x_before + eta * u
-    acceleration = (x_after - 2 * x + x_before) / SAMPLING_STEP**2
-    velocity = (x_after - x) / SAMPLING_STEP
+    acceleration = (x_after - 2 * x + x_before) / SILVERBOX_SAMPLING_STEP**2
+    velocity = (x_after - x) / SILVERBOX_SAMPLING_STEP
     assert p.m * acceleration + p.c * velocity + p.a * x + p.b * x**3 == pytest.approx(u, rel=1e-12)
 
 
 def test_the_continuous_twin_is_what_it_was_identified_as():
-    found = coefficients_of(duffing(), CONTINUOUS_TWIN) / SAMPLING_STEP ** np.array([2, 2, 1, 2])
+    found = coefficients_of(duffing(), SILVERBOX_ODE_TWIN) / SILVERBOX_SAMPLING_STEP ** np.array([2, 2, 1, 2])
     np.testing.assert_allclose(found, [184255, 730155, 41.8992, 186015], rtol=1e-14)
 
 
@@ -106,13 +106,13 @@ def test_a_batch_goes_there_and_back_as_its_rows_do(name):
     points = coefficients_of(model, many)
     assert points.shape == (2, 3, model.n_coefficients)
     cov = 1e-6 * (np.eye(model.n_coefficients) + points[..., :, None] * points[..., None, :])
-    means, covs = propagate(model, points, cov)
+    means, covs = propagate_to_physical(model, points, cov)
     np.testing.assert_allclose(means, vector(model, many), rtol=1e-11)
     for index in np.ndindex(2, 3):
         # The last places differ: a float and an array take different routes to a power.
         one = coefficients_of(model, {key: value[index] for key, value in many.items()})
         np.testing.assert_allclose(points[index], one, rtol=1e-12, atol=0)
-        for whole, single in zip((means, covs), propagate(model, points[index], cov[index]), strict=True):
+        for whole, single in zip((means, covs), propagate_to_physical(model, points[index], cov[index]), strict=True):
             np.testing.assert_allclose(whole[index], single, rtol=1e-12, atol=0)
 
 
@@ -127,7 +127,7 @@ def test_slopes_equal_central_differences(name):
     # Sizes differ by many orders: an entry is judged as a change for a change of 100 %.
     relative = points / size[:, None]
     np.testing.assert_allclose(
-        physical_slopes(model, points) * relative, np.stack(columns, axis=-1) * relative, atol=1e-7, rtol=1e-7
+        physical_jacobian(model, points) * relative, np.stack(columns, axis=-1) * relative, atol=1e-7, rtol=1e-7
     )
 
 
@@ -137,7 +137,7 @@ def test_propagation_equals_monte_carlo():
     # Deviations of 1e-4 keep the second order far below the sampling error of the mean.
     factor = 1e-4 * mean[:, None] * rng.normal(size=(4, 4))
     physical = to_physical(PAPER, mean + rng.normal(size=(200_000, 4)) @ factor.T)
-    found_mean, found_cov = propagate(PAPER, mean, factor @ factor.T)
+    found_mean, found_cov = propagate_to_physical(PAPER, mean, factor @ factor.T)
     np.testing.assert_allclose(found_mean, vector(PAPER, OSCILLATOR), rtol=1e-12)
     deviations, root = physical - found_mean, np.sqrt(len(physical))
     products = deviations[:, :, None] * deviations[:, None, :]
@@ -151,7 +151,7 @@ def test_a_model_without_parameters_has_its_coefficients():
     named = dict(zip(model.coefficients, points.T, strict=True))
     np.testing.assert_array_equal(coefficients_of(model, named), points)
     np.testing.assert_array_equal(to_physical(model, points), points)
-    np.testing.assert_array_equal(physical_slopes(model, points)[1], np.eye(model.n_coefficients))
+    np.testing.assert_array_equal(physical_jacobian(model, points)[1], np.eye(model.n_coefficients))
 
 
 @table("step", [0.0, -1.0, np.inf, np.nan])
@@ -168,8 +168,8 @@ def test_scales_multiply_the_parameters_by_their_dimensions():
     plain = to_physical(PAPER, inside, Scales(1e-3))
     np.testing.assert_allclose(plain * 20.0 / 0.03 ** np.array([1, 1, 1, 3]), [0.4, 0.6, 2500.0, 4e7], rtol=1e-12)
     np.testing.assert_allclose(to_physical(PAPER, inside, scales), [0.4, 0.6, 2500.0, 4e7], rtol=1e-12)
-    slopes = physical_slopes(PAPER, inside, Scales(1e-3))[0] * 20.0 / 0.03
-    np.testing.assert_allclose(physical_slopes(PAPER, inside, scales)[0], slopes, rtol=1e-12)
+    slopes = physical_jacobian(PAPER, inside, Scales(1e-3))[0] * 20.0 / 0.03
+    np.testing.assert_allclose(physical_jacobian(PAPER, inside, scales)[0], slopes, rtol=1e-12)
 
 
 def test_a_parameter_that_is_missing_is_named():

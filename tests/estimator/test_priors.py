@@ -10,8 +10,8 @@ import pytest
 from tables import table
 
 from estimator import (
-    CONTINUOUS_TWIN,
-    SAMPLING_STEP,
+    SILVERBOX_ODE_TWIN,
+    SILVERBOX_SAMPLING_STEP,
     SILVERBOX_TWIN,
     Parameters,
     coefficients_of,
@@ -59,7 +59,7 @@ def test_log_uniform_moments_obey_closed_forms():
 @pytest.mark.parametrize("spread", [0.5, 0.999])
 def test_log_uniform_moments_have_converged(spread, monkeypatch):
     # A c δ as large as m makes the coefficients as nonlinear as they get.
-    center = Parameters({**OSCILLATOR, "c": OSCILLATOR.m / SAMPLING_STEP})
+    center = Parameters({**OSCILLATOR, "c": OSCILLATOR.m / SILVERBOX_SAMPLING_STEP})
     mean, cov = log_uniform_moments(PAPER, center, spread)
     monkeypatch.setattr(module, "_NODES", 25)
     monkeypatch.setattr(module, "_POINTS", 25**4)
@@ -97,7 +97,7 @@ def test_log_uniform_moments_do_not_depend_on_threads():
 
 
 @pytest.mark.parametrize(
-    ("model", "twin"), [(PAPER, SILVERBOX_TWIN), (duffing(), CONTINUOUS_TWIN)], ids=["paper", "duffing"]
+    ("model", "twin"), [(PAPER, SILVERBOX_TWIN), (duffing(), SILVERBOX_ODE_TWIN)], ids=["paper", "duffing"]
 )
 def test_silverbox_prior_matches_the_oscillators_it_is_drawn_from(model, twin):
     prior = silverbox_prior(

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from estimator import progress
+from estimator.support import progress
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def clock(monkeypatch):
 
 
 def test_lines_say_the_share_and_the_time_that_is_left(clock, capsys):
-    with progress.progress("Training") as tell:
+    with progress.show_progress("Training") as tell:
         tell(0.0)
         clock["now"] += 4.9
         tell(0.1, "return 3")
@@ -29,7 +29,7 @@ def test_lines_say_the_share_and_the_time_that_is_left(clock, capsys):
 
 
 def test_what_is_gone_on_with_is_as_quick_as_what_was_done_of_it(clock, capsys):
-    with progress.progress("Training") as tell:
+    with progress.show_progress("Training") as tell:
         tell(0.5)
         clock["now"] += 10.0
         tell(0.6)
@@ -39,7 +39,7 @@ def test_what_is_gone_on_with_is_as_quick_as_what_was_done_of_it(clock, capsys):
 
 
 def test_lines_become_seldom_and_are_short(clock, capsys):
-    with progress.progress("Evaluating") as tell:
+    with progress.show_progress("Evaluating") as tell:
         for second in range(3600):
             clock["now"] += 1.0
             tell(second / 3600, "a policy of a long name " * 9)
@@ -52,7 +52,7 @@ def test_a_terminal_has_a_bar(clock, monkeypatch, capsys):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "300")
-    with progress.progress("Designing") as tell:
+    with progress.show_progress("Designing") as tell:
         for share in (0.0, 0.5):
             clock["now"] += 30.0
             tell(share, "a candidate " * 30)

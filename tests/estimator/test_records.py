@@ -8,35 +8,35 @@ from oscillators import BENCH, SOFT, rig_of, simulated
 from tables import table
 
 from estimator import Channel, Rig, identify
-from estimator.identification import records
-from estimator.identification.records import clipped, records_of
+from estimator.identification.data import record_reader
+from estimator.identification.data.record_reader import find_clipped_outputs, read_records
 
 
 def read(path, rig):
     """Inputs and outputs of a file with one record."""
-    (one,) = records.read(path, rig)
+    (one,) = record_reader.read_record_file(path, rig)
     return one.u, one.y
 
 
 def test_a_converter_s_levels_are_no_stop():
     _, y = simulated(BENCH)
     level = np.abs(y).max() / 100
-    assert not clipped(level * np.round(y / level)).any()
-    assert not clipped(np.concatenate([np.full(100, y.min()), y])).any()
+    assert not find_clipped_outputs(level * np.round(y / level)).any()
+    assert not find_clipped_outputs(np.concatenate([np.full(100, y.min()), y])).any()
 
 
 def test_a_stop_that_single_samples_meet_is_found():
     rng = np.random.default_rng(0)
     y = np.sin(2.2 * np.arange(500)) + 0.01 * rng.standard_normal(500)
-    assert np.array_equal(clipped(np.minimum(y, 0.98)), y >= 0.98)
+    assert np.array_equal(find_clipped_outputs(np.minimum(y, 0.98)), y >= 0.98)
     assert np.diff(np.flatnonzero(y >= 0.98)).min() > 1
-    assert not clipped(y).any()
+    assert not find_clipped_outputs(y).any()
 
 
 def test_a_short_piece_between_missing_inputs_is_left_out():
     u, y = simulated(SOFT, samples=400)
     u[[200, 205]] = np.nan
-    assert [(one.name, len(one.u)) for one in records_of((u, y), Rig(0.01))] == [
+    assert [(one.name, len(one.u)) for one in read_records((u, y), Rig(0.01))] == [
         ("record 0", 200),
         ("record 0, from sample 206", 194),
     ]
@@ -49,21 +49,21 @@ def test_files(tmp_path):
     plain.write_text("\n".join(lines))
     lines[7] = lines[7].rsplit(",", 1)[0] + ","
     named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
-    (one,), (other,) = (records_of(path, Rig(0.01)) for path in (plain, str(named)))
+    (one,), (other,) = (read_records(path, Rig(0.01)) for path in (plain, str(named)))
     np.testing.assert_array_equal(one.u, u)
     assert (one.missing, other.missing) == (0, 1)
     from scipy.io import savemat
 
     savemat(tmp_path / "r.mat", {"u": u, "y": y})
-    np.testing.assert_array_equal(records_of(tmp_path / "r.mat", Rig(0.01))[0].y, y)
+    np.testing.assert_array_equal(read_records(tmp_path / "r.mat", Rig(0.01))[0].y, y)
     whole = bytearray((tmp_path / "r.mat").read_bytes())
     whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
     (tmp_path / "r.mat").write_bytes(whole)
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file, but is not: the reader died"):
-        records_of(tmp_path / "r.mat", Rig(0.01))
+        read_records(tmp_path / "r.mat", Rig(0.01))
     (tmp_path / "r.mat").write_bytes(b"none")
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file"):
-        records_of(tmp_path / "r.mat", Rig(0.01))
+        read_records(tmp_path / "r.mat", Rig(0.01))
 
 
 @table(
@@ -157,7 +157,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
 def test_errors_of_files_name_the_line(tmp_path, text, message):
     (tmp_path / "r.csv").write_text(text)
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        records_of(tmp_path / "r.csv", Rig(0.01))
+        read_records(tmp_path / "r.csv", Rig(0.01))
     assert "r.csv" in str(error.value)
 
 
@@ -233,7 +233,9 @@ def test_a_mat_file_is_read_by_nothing_that_lies_beside_it_and_not_for_ever(tmp_
     for name in ("numpy", "io", "scipy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was executed')")
     np.testing.assert_array_equal(read("r.mat", Rig(0.01))[1], y)
-    monkeypatch.setattr("estimator.identification.records._PATIENCE", 0.0)  # which no machine is quick enough for
+    monkeypatch.setattr(
+        "estimator.identification.data.record_reader._MAT_TIMEOUT", 0.0
+    )  # which no machine is quick enough for
     with pytest.raises(ValueError, match=r"r\.mat must be a MAT file that can be read within 0 s, but was not"):
         read("r.mat", Rig(0.01))
 
@@ -262,51 +264,51 @@ def test_samples_that_come_twice_are_refused(how):
         f"{later} must have samples of its own, but from its sample {at} on has those of {earlier} from sample {begin}"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
-        records_of(given, Rig(0.01))
+        read_records(given, Rig(0.01))
 
 
 def test_experiments_that_were_repeated_are_two_records():
     """The same inputs, periodic ones without noise, and rests between two levels of a converter, are no copies."""
     rng = np.random.default_rng(0)
     u, y = simulated(SOFT, samples=1_000)
-    assert len(records_of([(u, y), (u, y + 1e-3 * rng.standard_normal(1_000))], Rig(0.01))) == 2
+    assert len(read_records([(u, y), (u, y + 1e-3 * rng.standard_normal(1_000))], Rig(0.01))) == 2
     half = np.repeat([0.5, -0.5], 500)
-    assert len(records_of([(half, y), (half, y[::-1].copy())], Rig(0.01))) == 2
+    assert len(read_records([(half, y), (half, y[::-1].copy())], Rig(0.01))) == 2
     period = np.tile(np.sin(np.arange(100) * 2 * np.pi / 100), 6)
     gap = np.concatenate([period, [np.nan], period])
-    assert len(records_of((gap, np.roll(period, 9)[np.arange(len(gap)) % 600]), Rig(0.01))) == 2
+    assert len(read_records((gap, np.roll(period, 9)[np.arange(len(gap)) % 600]), Rig(0.01))) == 2
     rest = np.zeros(300)
     one, other = (
         (np.concatenate([rest, u]), np.concatenate([rest, noisy]))
         for noisy in (y, y + 1e-3 * rng.standard_normal(1_000))
     )
-    assert len(records_of([one, other], Rig(0.01))) == 2
+    assert len(read_records([one, other], Rig(0.01))) == 2
     # A converter whose levels are ten times the noise: most outputs are those of the first time.
     level = np.ptp(y) / 100
     coarse = [level * np.round((y + 0.1 * level * rng.standard_normal(1_000)) / level) for _ in range(2)]
     assert 0.85 < (coarse[0] == coarse[1]).mean() < 1
-    assert len(records_of([(u, one) for one in coarse], Rig(0.01))) == 2
+    assert len(read_records([(u, one) for one in coarse], Rig(0.01))) == 2
 
 
 def test_a_million_samples_are_compared_at_once():
-    from estimator.identification.shared import shared
+    from estimator.identification.data.duplicate_samples import find_shared_samples
 
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((2, 1_000_000))
-    assert shared([(u, y), (u, y[::-1])]) is None
-    assert shared([(u[:600_000], y[:600_000]), (u[599_900:], y[599_900:])]) == (0, 599_900, 1, 0)
+    assert find_shared_samples([(u, y), (u, y[::-1])]) is None
+    assert find_shared_samples([(u[:600_000], y[:600_000]), (u[599_900:], y[599_900:])]) == (0, 599_900, 1, 0)
 
 
 def test_an_absurd_number_is_refused_by_record_and_sample(tmp_path):
     u, y = simulated(SOFT, samples=400)
     y[7] = 1e300
     with pytest.raises(ValueError, match=r"y of record 0 must be within ±1e\+30, but at sample 7 is 1e\+300; leave it"):
-        records_of((u, y), rig_of(SOFT))
+        read_records((u, y), rig_of(SOFT))
     path = tmp_path / "absurd.csv"
     path.write_text("u,y\n" + "".join(f"{a!r},{b!r}\n" for a, b in zip((-u).tolist(), u.tolist(), strict=True)))
     path.write_text(path.read_text().replace(repr(-float(u[3])), "-1e299", 1))
     with pytest.raises(ValueError, match=rf"u of {re.escape(str(path))} must be within ±1e\+30, but at sample \d+ is "):
-        records_of(path, rig_of(SOFT))
+        read_records(path, rig_of(SOFT))
 
 
 def written(u, y, kind, step=0.01):
@@ -346,7 +348,7 @@ def written(u, y, kind, step=0.01):
 def test_files_of_instruments_are_read_in_their_units(tmp_path, kind, encoding):
     u, y = simulated(SOFT, samples=400)
     (tmp_path / "r.csv").write_bytes(written(u, y, kind).encode(encoding))
-    (one,) = records_of(tmp_path / "r.csv", Rig(0.01))
+    (one,) = read_records(tmp_path / "r.csv", Rig(0.01))
     assert one.times is None, "they are a step apart"
     np.testing.assert_allclose(one.u, u[: len(one.u)], rtol=1e-14)
     scale = 1e3 if kind == "units below" else 1.0
@@ -368,5 +370,5 @@ def test_lost_lines_and_values_over_range_are_missing(tmp_path):
     lines[50] = "0.50,1.0,∞"
     del lines[200:203]
     (tmp_path / "r.csv").write_text("\n".join(["time [s],force [N],displacement [m]", *lines]), encoding="utf-8")
-    first, second = records_of(tmp_path / "r.csv", Rig(0.01))
+    first, second = read_records(tmp_path / "r.csv", Rig(0.01))
     assert (first.clipped, first.missing, len(first.u), len(second.u)) == (1, 0, 200, 197)

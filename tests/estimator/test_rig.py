@@ -12,11 +12,11 @@ import pytest
 from tables import table
 
 from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estimator
-from estimator.electronic_duffing import electronic_duffing
-from estimator.parameters import SAMPLING_STEP
-from estimator.rig import SHIPPED
-from estimator.rig_prior import rig_prior
-from estimator.units import Scales
+from estimator.rigs.electronic_duffing import electronic_duffing
+from estimator.rigs.rig import SHIPPED_RIGS
+from estimator.rigs.rig_prior import rig_prior
+from estimator.rigs.units import Scales
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 GUESS = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (-1e8, 1e8)}
 BENCH = Rig(1e-3, input=Channel("N", limit=20.0), output=Channel("m", range=0.03), guess=GUESS)
@@ -56,7 +56,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
         BENCH,
         Rig(np.float64(1 / 3), "linear", 2, {"unit": "N", "limit": np.float32(0.1), "noise": 1e-7, "offset": -0.2}),
         replace(BENCH, delay=-1, output=Channel("µm/s²", None, 3, "acceleration", 1e-300 * 1e280, 5.0, "Weg ü")),
-        *map(Rig.shipped, SHIPPED),
+        *map(Rig.shipped, SHIPPED_RIGS),
     ],
 )
 def test_a_saved_rig_is_the_same(rig, tmp_path):
@@ -121,15 +121,19 @@ def test_a_broken_file_is_named(tmp_path):
 
 
 def test_rigs_that_ship():
-    assert set(SHIPPED) == {
+    assert set(SHIPPED_RIGS) == {
         "silverbox",
         "beam",
         "electronic-duffing",
         "electronic-duffing-two-wells",
         "electronic-duffing-velocity",
     }
-    assert Rig.silverbox() == Rig.shipped("silverbox") == Rig(SAMPLING_STEP, "spline", 0, Channel("V"), Channel("V"))
-    assert Rig.silverbox("zero_order", 1) == Rig(SAMPLING_STEP, "zero_order", 1, Channel("V"), Channel("V"))
+    assert (
+        Rig.silverbox()
+        == Rig.shipped("silverbox")
+        == Rig(SILVERBOX_SAMPLING_STEP, "spline", 0, Channel("V"), Channel("V"))
+    )
+    assert Rig.silverbox("zero_order", 1) == Rig(SILVERBOX_SAMPLING_STEP, "zero_order", 1, Channel("V"), Channel("V"))
     with pytest.raises(ValueError, match=r"name must be one of .*, but is 'bea'; did you mean 'beam'\?"):
         Rig.shipped("bea")
 
@@ -240,11 +244,11 @@ def test_an_estimator_of_a_rig_is_saved_whole(tmp_path):
 def test_the_instrument_comes_from_the_file_that_the_rig_comes_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("beam").write_text("step = 0.5\n[instrument]\nresource = 'ASRL1'\n", encoding="utf-8-sig")
-    assert Rig.with_instrument("beam") == (Rig.shipped("beam"), {})
-    assert Rig.with_instrument("./beam") == (Rig(0.5), {"resource": "ASRL1"})
+    assert Rig.read_with_instrument("beam") == (Rig.shipped("beam"), {})
+    assert Rig.read_with_instrument("./beam") == (Rig(0.5), {"resource": "ASRL1"})
     Path("beam").write_text("step = 0.5\ninstrument = 3\n")
     with pytest.raises(ValueError, match="beam must be a rig file, but is not: instrument must be a table, but is 3"):
-        Rig.with_instrument("./beam")
+        Rig.read_with_instrument("./beam")
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ def test_nothing_is_half_written(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("estimator.files.os.replace", fail)
+    monkeypatch.setattr("estimator.support.file_io.os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         save_estimator(KINDS["ode"](), path)
     assert path.read_bytes() == before

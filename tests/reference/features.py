@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureSettings
 from duffing_env.storage.kernel_spec import observation_bounds
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 
 COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 ENTRIES = tuple(observation_bounds(difference()))

@@ -1,6 +1,6 @@
 """Models that only tests have: what somebody who adds a plant has to write."""
 
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM

@@ -7,7 +7,7 @@ import pytest
 
 from agents.evaluation.oracle import Oracle, TrackSystems
 from estimator.free_run import free_run
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from research.oracles.certificate import Certificate
 from research.oracles.input_mixture import BoundMultipliers, improve_mixture
 from research.oracles.state_grid import StateGrid

@@ -8,7 +8,7 @@ import pytest
 from agents.evaluation import oracle as module_of_oracle
 from agents.evaluation.oracle import Oracle, TrackSystems
 from agents.planning.model_probe import ModelView, probe_time_scales
-from estimator.extras import how_to_get, is_missing
+from estimator.support.optional_dependencies import install_hint, is_not_installed
 from research.oracles import oracle_search
 from research.oracles.linear_programme import LinearProgramme
 from research.oracles.oracle_search import Config, main, search_best_input
@@ -16,7 +16,7 @@ from research.oracles.slp_refinement import refine_input
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
 
-pytestmark = pytest.mark.skipif(is_missing("highspy"), reason=how_to_get("highspy"))
+pytestmark = pytest.mark.skipif(is_not_installed("highspy"), reason=install_hint("highspy"))
 
 
 @pytest.fixture

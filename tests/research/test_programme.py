@@ -66,6 +66,6 @@ def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_ne
 
 
 def test_without_highspy_it_says_which_extra_brings_it(monkeypatch):
-    monkeypatch.setattr("estimator.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("estimator.support.optional_dependencies.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"^highspy is not installed; get it with: .*duffing-env\[oracle\]'$"):
         LinearProgramme(SAMPLES, STATES, 0, DesignLimits(0.52, 0.51, 0.1, np.inf))

@@ -34,8 +34,8 @@ from estimator.belief import Belief
 from estimator.engine.motion import coarsened
 from estimator.lanes import kernel
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
-from estimator.progress import Tell, untold
+from estimator.support.array_types import FloatArray
+from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: Systems that a block is planned for.
 N_SYSTEMS = 32
@@ -143,7 +143,7 @@ def _compile_momentum_ascent(model: Model, degree: int) -> Any:
 
 def optimise_block(
     view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, candidates: FloatArray, amplitude: float, max_probability: float,
-    n_safe_samples: int | None = None, tell: Tell = untold,
+    n_safe_samples: int | None = None, tell: ProgressCallback = ignore_progress,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
     """The best input that is safe enough: what tells most on average, of the summits that candidates lead to.
 
@@ -184,7 +184,7 @@ def optimise_block(
 
 def _climb_candidate(
     view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, amplitude: float, max_probability: float, n_safe_samples: int | None, u: FloatArray,
-    tell: Tell,
+    tell: ProgressCallback,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
     """As `optimise_block`, from one candidate (T,)."""
     ascend = _compile_momentum_ascent(

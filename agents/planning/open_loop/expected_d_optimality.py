@@ -21,7 +21,7 @@ from estimator.engine.gradient_lanes import paths
 from estimator.engine.rows import input_rows, path_names
 from estimator.lanes import LANES, kernel, part
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 
 class SampledSystems(NamedTuple):

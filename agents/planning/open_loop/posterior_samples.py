@@ -13,7 +13,7 @@ from estimator.belief import Belief, covariance_places
 from estimator.free_run import free_run
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
-from estimator.parameters import FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Systems that are drawn from a belief, at least.
 MIN_DRAWS = 500

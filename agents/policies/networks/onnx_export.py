@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from agents.policies.networks.trained_policy import TrainedPolicy
-from estimator.extras import need
-from estimator.files import write_atomically
+from estimator.support.file_io import write_atomically
+from estimator.support.optional_dependencies import require_packages
 
 #: Of the operators that are used; old enough for every runtime of today.
 _OPSET_VERSION = 17
@@ -31,7 +31,7 @@ def export_network(policy: TrainedPolicy, path: str | Path) -> None:
         ValueError: for a policy with a memory.
         OSError: where the file cannot be written.
     """
-    need("onnx")
+    require_packages("onnx")
     import onnx
     from onnx import helper, numpy_helper
 

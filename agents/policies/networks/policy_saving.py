@@ -28,8 +28,8 @@ from agents.policies.networks.trained_policy import (
     TrainedPolicy,
     observation_name,
 )
-from estimator.checks import mapping, number, numbers, shown, whole
-from estimator.files import file_name, write_atomically, writing
+from estimator.support.argument_checks import check_integer, check_mapping, check_number, short_repr, to_float_array
+from estimator.support.file_io import explain_write_errors, to_path, write_atomically
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -85,7 +85,7 @@ def check_policy_folder(name: str, folder: str | Path) -> Path:
         ValueError: for what is no path, or the folder of a training run, whose policy is that of its log.
         NotADirectoryError: where it is a file.
     """
-    place = file_name(name, folder)
+    place = to_path(name, folder)
     check_output_folder(name, place)
     if (place / CONFIG_FILE).exists():
         raise ValueError(f"{name} must be a folder for a policy, but {place} holds a run; remove it or name another")
@@ -101,14 +101,14 @@ def write_policy(
     """As `save_policy`, and also into the folder of a run, by the training itself."""
     from torch.nn import Module
 
-    mapping("card", {} if card is None else card)
+    check_mapping("card", {} if card is None else card)
     if isinstance(model, Module):
         _write_files(folder, *_card_of_module(model, normalizer), card or {})
         return
     if normalizer is not None:
         raise ValueError("normalizer must be None for an algorithm, whose VecNormalize is written; leave it out")
     if not hasattr(model, "policy"):
-        raise ValueError(f"model must be an algorithm or a module of torch, but is {shown(model)}; pass one")
+        raise ValueError(f"model must be an algorithm or a module of torch, but is {short_repr(model)}; pass one")
     card = {"algorithm": type(model).__name__.lower(), "steps": model.num_timesteps} if card is None else card
     check_wrappers(model)
     environments = wrapped_environments(model)
@@ -146,7 +146,7 @@ def _write_files(folder: Path, network: NetworkCard, tensors: dict[str, Any], ca
     except KeyError as error:
         raise ValueError(f"model must have a bias in every layer, but {error} is missing; give it one") from error
     folder.mkdir(parents=True, exist_ok=True)
-    with writing(folder):
+    with explain_write_errors(folder):
         half_written = Path(tempfile.mkdtemp(dir=folder, prefix=f".{WEIGHTS_FILE}."))
     try:
         write_atomically(half_written / WEIGHTS_FILE, save(tensors))
@@ -165,13 +165,13 @@ def _write_files(folder: Path, network: NetworkCard, tensors: dict[str, Any], ca
 
 def _check_card(card: dict[str, Any]) -> None:
     """Refuse a card that JSON cannot hold, or whose steps are no number of samples, which the protocol reads."""
-    whole("card['steps']", card.get("steps", 0), MAX_STEPS, 0)
+    check_integer("card['steps']", card.get("steps", 0), MAX_STEPS, 0)
     for key, value in card.items():
         try:
             json.dumps(value)
         except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(
-                f"card[{key!r}] must be what JSON can hold, but is {shown(value)}: {error}; "
+                f"card[{key!r}] must be what JSON can hold, but is {short_repr(value)}: {error}; "
                 "pass e.g. float(...) or str(...)"
             ) from error
 
@@ -197,10 +197,10 @@ def _card_of_module(model: Module, normalizer: ObservationNormalizer | None) -> 
         if not isinstance(normalizer, tuple | list) or len(normalizer) != 3:
             raise ValueError(
                 "normalizer must be mean, standard deviation, and how many of these are seen at most, but is "
-                f"{shown(normalizer)}; pass all three"
+                f"{short_repr(normalizer)}; pass all three"
             )
-        mean, std = (numbers(f"normalizer[{k}]", normalizer[k]).astype(np.float32) for k in (0, 1))
-        number("normalizer[2]", normalizer[2], remedy="pass e.g. 10.0")
+        mean, std = (to_float_array(f"normalizer[{k}]", normalizer[k]).astype(np.float32) for k in (0, 1))
+        check_number("normalizer[2]", normalizer[2], remedy="pass e.g. 10.0")
         network = replace(network, normalised=float(normalizer[2]))
         tensors |= {"normalizer.mean": mean, "normalizer.std": std}
     return network, tensors

@@ -35,11 +35,11 @@ from agents.planning.model_probe import (
     probe_time_scales,
 )
 from estimator.arrays import copy, copy_scaled, fill
-from estimator.checks import shown
 from estimator.engine.motion import motion
 from estimator.lanes import jit, kernel, part
 from estimator.models.model import Model
-from estimator.parameters import FloatArray
+from estimator.support.argument_checks import short_repr
+from estimator.support.array_types import FloatArray
 
 FIRST_INPUTS = ("up", "none", "down")
 
@@ -419,7 +419,7 @@ class FeatureEncoder:
             )
         if experiment.observation != "posterior":
             raise ValueError(
-                f"env must show the observation 'posterior' for features, but shows {shown(experiment.observation)}; "
+                f"env must show the observation 'posterior' for features, but shows {short_repr(experiment.observation)}; "
                 "leave out the option observation"
             )
         if experiment.hold != 1:

@@ -19,9 +19,9 @@ import numpy.typing as npt
 from agents.policies.networks.compiled_actor import CompiledActor, compile_decision
 from agents.policies.networks.rollout_features import FeatureEncoder
 from agents.predict_checks import check_observation_finite, check_observation_size, check_state, episode_starts
-from estimator.checks import number, numbers, whole
-from estimator.files import whole_file
 from estimator.models.model import Model
+from estimator.support.argument_checks import check_integer, check_number, to_float_array
+from estimator.support.file_io import check_readable_file
 
 WEIGHTS_FILE = "policy.safetensors"
 CARD_FILE = "policy.json"
@@ -131,7 +131,7 @@ class TrainedPolicy:
         self.normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
             mean, std = (_tensor(tensors, f"normalizer.{part}", self._n_inputs) for part in ("mean", "std"))
-            number("normalised", network.normalised)
+            check_number("normalised", network.normalised)
             if std.min() <= 0:
                 raise ValueError(f"normalizer.std must be positive, but is {std.min()} somewhere; take 1 there")
             self.normalizer = mean, std, float(network.normalised)
@@ -197,7 +197,7 @@ class TrainedPolicy:
         if self.network.features and encoder is None:
             raise ValueError("env must be given to a policy for all oscillators, but is None; pass it to make_policy")
         if type(observation) is not np.ndarray or observation.dtype.kind != "f":
-            observation = numbers("observation", observation)
+            observation = to_float_array("observation", observation)
         float_observation = np.asarray(observation, dtype=np.float32)
         size = self._n_inputs if encoder is None else encoder.observation_size
         check_observation_size(float_observation, size)
@@ -261,14 +261,14 @@ def training_steps_of(folder: Path) -> int:
     """
     try:
         card = json.loads(
-            whole_file(folder / CARD_FILE, f"policy folder must hold {CARD_FILE}", _MAX_FILE_BYTES).read_text(
+            check_readable_file(folder / CARD_FILE, f"policy folder must hold {CARD_FILE}", _MAX_FILE_BYTES).read_text(
                 encoding="utf-8"
             )
         )
         steps = card.get("steps", 0)
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise ValueError(f"policy folder must hold a sound {CARD_FILE}, but {folder} does not: {error}") from error
-    whole(f"steps of {folder / CARD_FILE}", steps, MAX_STEPS, 0)
+    check_integer(f"steps of {folder / CARD_FILE}", steps, MAX_STEPS, 0)
     return int(steps)
 
 
@@ -344,7 +344,7 @@ def load_policy(folder: str | Path, seed: int = 0) -> TrainedPolicy:
             f"with agents.save_policy({str(folder).removesuffix('.zip')!r}, PPO.load(...))"
         )
     for name in (WEIGHTS_FILE, CARD_FILE):
-        whole_file(folder / name, f"policy folder must hold {name}", _MAX_FILE_BYTES)
+        check_readable_file(folder / name, f"policy folder must hold {name}", _MAX_FILE_BYTES)
     try:
         card = json.loads((folder / CARD_FILE).read_text())
         # Copies, because a tensor may lie unaligned in the file, and NumPy then multiplies in another order.

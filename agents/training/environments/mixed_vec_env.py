@@ -17,8 +17,8 @@ from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncode
 from agents.sb3_vec_env import BatchVecEnv, info_of_row, infos_by_row
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, has_shaping_potential
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.checks import shown
 from estimator.lanes import LANES
+from estimator.support.argument_checks import short_repr
 
 #: Draws what a group plays next: the id of a track, and the options of its environments.
 DrawOptions = Callable[[np.random.Generator], tuple[str, dict[str, Any]]]
@@ -121,7 +121,7 @@ class MixedVecEnv(BatchVecEnv):
         """
         if any(self._options):
             raise ValueError(
-                f"options must be none where they are drawn, but are {shown(self._options)}; leave them out"
+                f"options must be none where they are drawn, but are {short_repr(self._options)}; leave them out"
             )
         self.reset_infos = [info for group in self._groups for info in group.row_infos()]
         return self.normalizer(np.concatenate([group.current_features.values for group in self._groups]))

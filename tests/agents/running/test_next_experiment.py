@@ -19,8 +19,8 @@ from agents.hardware.simulated_plant import SimulatedPlant
 from agents.hardware.simulated_plant import plant as simulated
 from agents.planning.open_loop.posterior_samples import equilibria
 from estimator import OnlineEstimator, identify, load_estimator, save_estimator
-from estimator.identification.beliefs import disturbance
-from estimator.identification.tables import read_table
+from estimator.identification.data.text_tables import read_table
+from estimator.identification.fitting.posterior_belief import disturbance_std
 from estimator.models.duffing import duffing
 
 
@@ -257,7 +257,7 @@ def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
     assert np.abs(known.state_mean[0]) > 10 * np.sqrt(known.state_cov[0, 0]), "as where an input drove it"
     last = played("next", 128, prior=known, plan={"block": block})
     assert (last.ended, last.message) == ("complete", "")
-    assert 0.5 < disturbance(last.belief) / RIG.input.noise < 2.0
+    assert 0.5 < disturbance_std(last.belief) / RIG.input.noise < 2.0
     for name, (mean, std) in last.parameters.items():
         assert std < 1.02 * first.parameters[name][1], name
         assert abs(mean - TRUTH.get(name, 0.0)) < 4 * std, name

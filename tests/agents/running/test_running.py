@@ -29,8 +29,8 @@ from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies.signals import hold_for_resonance
 from estimator import Channel, OnlineEstimator, Rig, identify
 from estimator.free_run import free_run
-from estimator.identification.beliefs import refit
-from estimator.rig_prior import HALF_WIDTH
+from estimator.identification.fitting.posterior_belief import refit_coefficients
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 
 class Bench(SimulatedPlant):
@@ -296,7 +296,9 @@ def test_where_a_fit_of_all_blocks_begins_does_not_matter():
     follower, plant = RunEstimator(RIG), Bench()
     plant.arm(None)
     played, prior = two_blocks(follower, plant), RunEstimator(RIG).belief
-    first, second = (refit(RIG, played, prior, near) for near in (follower.belief, identify(RIG, played).belief))
+    first, second = (
+        refit_coefficients(RIG, played, prior, near) for near in (follower.belief, identify(RIG, played).belief)
+    )
     std = np.sqrt(np.diag(first[1]))
     np.testing.assert_allclose(first[0] / std, second[0] / std, atol=0.05)
     np.testing.assert_allclose(first[1] / np.outer(std, std), second[1] / np.outer(std, std), atol=0.05)
@@ -392,10 +394,12 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
     left, promised, rng = 0, [], np.random.default_rng(5)
     for k in range(200):
         middle = {name: (low + high) / 2 for name, (low, high) in rig.guess.items()}
-        half = {name: (high - low) / 2 / HALF_WIDTH for name, (low, high) in rig.guess.items()}
+        half = {name: (high - low) / 2 / STDS_PER_90_PERCENT for name, (low, high) in rig.guess.items()}
         truth = {name: middle[name] + half[name] * rng.standard_normal() for name in middle}
         low, high = rig.guess["m"]
-        truth["m"] = float(np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / HALF_WIDTH * rng.standard_normal()))
+        truth["m"] = float(
+            np.exp(np.log(low * high) / 2 + np.log(high / low) / 2 / STDS_PER_90_PERCENT * rng.standard_normal())
+        )
         follower, plant = listened(rig, truth, k)
         observed = EnvView(rig, follower.belief, 64)
         futures = MonteCarloSystems(follower.online.model, follower.draw_systems(rng), 1.0, rng)

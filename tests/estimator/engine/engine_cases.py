@@ -11,7 +11,7 @@ from reference.plants import VAN_DER_POL
 from reference.structured import Belief
 
 from estimator.engine.rows import input_rows
-from estimator.models.difference import difference
+from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM

@@ -16,8 +16,8 @@ from benchmarks.interval_coverage import HYPOTHESES, LEVEL, WIDE_NOISES, Case, C
 from benchmarks.random_systems import MAX_INPUT, ODE, POPULATIONS, draw, make_prior, simulate
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference, duffing, recorded_prior
 from estimator.belief import Belief
-from estimator.models.difference import Term
-from estimator.parameters import SAMPLING_STEP
+from estimator.models.difference_equation import Term
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
 PHYSICAL = {"m", "c", "a", "b"}
@@ -181,14 +181,14 @@ def test_simulated_oscillators_obey_the_equation():
     given = coefficients_of(model, {"m": m, "c": c, "a": a, "b": b, "u0": u0, "y0": y0, "d": d})
     u, w = rng.uniform(-0.3, 0.3, (1, 60)), 1e-3 * rng.standard_normal((1, 60))
     y, _ = simulate(model, given[None], u, w, None)
-    gain = SAMPLING_STEP**2 / m
+    gain = SILVERBOX_SAMPLING_STEP**2 / m
     state, before = [0.0, 0.0], 0.0
     for t in range(60):
 
         def rates(time, state, before=before, t=t):
             force = gain * (before + time * (u[0, t] - before) - u0) + 2 * w[0, t]
             x, v = state
-            return [v, force - gain * (c / SAMPLING_STEP * v + a * x + b * x**3)]
+            return [v, force - gain * (c / SILVERBOX_SAMPLING_STEP * v + a * x + b * x**3)]
 
         state = solve_ivp(rates, (0, 1), state, rtol=1e-10, atol=1e-13).y[:, -1]
         assert y[0, t] == pytest.approx(state[0] + y0 + d * u[0, t], abs=5e-6)  # the error of 8 steps a sample

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from benchmarks.rigs.catalogue import BENCHES
-from benchmarks.rigs.loop import BenchPlant
-from benchmarks.rigs.simulator import KINDS, simulate
+from benchmarks.rigs.bench_catalogue import BENCHES
+from benchmarks.rigs.closed_loop import BenchPlant
+from benchmarks.rigs.dop853_simulator import SENSOR_KINDS, simulate
 
 
 def test_the_plant_is_the_integrator_sample_by_sample():
@@ -19,7 +19,7 @@ def test_the_plant_is_the_integrator_sample_by_sample():
         force = inputs + bench.process_noise * drawn[:, 0]
         start = np.array([bench.rest, 0.0])
         states, ends = simulate(np.array([*bench.truth, 0.0]), force, np.zeros(30), start, bench.step, bench.scale)
-        place = KINDS.index(bench.kind)
+        place = SENSOR_KINDS.index(bench.kind)
         clean = (ends if place == 2 else states[:, place])[1:]
         expected = clean + bench.sensor_noise * drawn[:, 1]
         np.testing.assert_allclose(shown, expected, rtol=0, atol=1e-8 * np.abs(clean).max())

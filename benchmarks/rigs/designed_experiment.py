@@ -1,0 +1,103 @@
+"""The next experiment, designed, played and identified: what was expected beside what came."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agents import console_output
+from benchmarks.rigs.bench_catalogue import PARAMETERS
+from benchmarks.rigs.calibration import INTERVAL_PROBABILITY, binomial_interval, compare_to_truth, run_in_processes
+from benchmarks.rigs.closed_loop import MAX_RANGE_EXIT_RATE, N_SAMPLES, BenchPlant, rig_of_bench, with_held_input
+from benchmarks.rigs.simulated_records import simulate_record
+
+#: Seeds of the noises of a second experiment: those of the first, and so much.
+_SECOND_SEED_OFFSET = 1_000_000
+
+
+@dataclass(frozen=True)
+class ExperimentOutcome:
+    """What came of one experiment.
+
+    Attributes:
+        before, expected, after: (4,) standard deviations of m, c, a and b, relative to the truth: before it, expected
+            after it, and as `identify` states them after it, from both records.
+        error: (4,) of the estimates after it, relative.
+        inside: (4,) whether the 90 % intervals hold the truth.
+        left: whether the output left its range.
+    """
+
+    before: list[float]
+    expected: list[float]
+    after: list[float]
+    error: list[float]
+    inside: list[bool]
+    left: bool
+
+
+def run_trial(task: tuple[str, str, int, int]) -> ExperimentOutcome:
+    """A record of some samples, or none; the next experiment by a policy; its answer; and both identified."""
+    from agents.hardware.next_experiment import design_experiment
+    from estimator import identify
+
+    name, policy, samples, seed = task
+    bench = with_held_input(name)
+    rig, records, prior = rig_of_bench(bench, seed, not samples), [], None
+    if samples:
+        first = simulate_record(bench, seed, samples)
+        records, prior = [(first.u, first.y)], identify(rig, (first.u, first.y)).belief
+    found = design_experiment(rig, prior, policy, N_SAMPLES, MAX_RANGE_EXIT_RATE, seed)
+    u, y = BenchPlant(bench, _SECOND_SEED_OFFSET + seed).play(found.u)
+    result = identify(rig, [*records, (u, y)])
+    truth = np.array(bench.truth)
+    error, std, inside = compare_to_truth(result.parameters, result.interval(INTERVAL_PROBABILITY), truth)
+    before = np.array([found.before.parameters()[p][1] for p in PARAMETERS])
+    expected = np.array([found.after[p] for p in PARAMETERS])
+    return ExperimentOutcome(
+        *((np.asarray(stds) / np.abs(truth)).tolist() for stds in (before, expected, std)),
+        error.tolist(), inside.tolist(), bool((np.abs(y) > bench.output_range).any()),
+    )  # fmt: skip
+
+
+def run_trials(
+    names: Sequence[str], policies: Sequence[str], samples: int, seeds: int, workers: int
+) -> dict[tuple[str, str], list[ExperimentOutcome]]:
+    """Trials by rig and policy."""
+    cells = [(name, policy, samples) for name in names for policy in policies]
+    trials = run_in_processes(run_trial, cells, seeds, workers, "Designing")
+    return {(name, policy): of_cell for (name, policy, _), of_cell in trials.items()}
+
+
+def print_report(found: dict[tuple[str, str], list[ExperimentOutcome]]) -> dict[str, Any]:
+    """Print the table and the verdict; return the verdict for the JSON file."""
+
+    def cells(values: Any) -> str:
+        return ", ".join(f"{value:.2f}" if value < 9.95 else f"{value:.0f}" for value in values)
+
+    rows = []
+    for (name, policy), trials in found.items():
+        before, expected, after, error = (
+            np.array([getattr(one, part) for one in trials]) for part in ("before", "expected", "after", "error")
+        )
+        rows.append((
+            name, policy, cells(np.median(before / expected, axis=0)), cells(np.median(after / expected, axis=0)),
+            cells(np.sqrt(np.mean((error / expected) ** 2, axis=0))),
+            cells(np.mean([one.inside for one in trials], axis=0)),
+            f"{sum(one.left for one in trials)} of {len(trials)}",
+        ))  # fmt: skip
+    titles = ("rig", "policy", "times narrower, expected", "stated / expected", "RMS error / expected",
+              "coverage of 90 %", "left its range")  # fmt: skip
+    console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True))
+    every = [one for trials in found.values() for one in trials]
+    ratios = np.array([one.after for one in every]) / np.array([one.expected for one in every])
+    left = sum(one.left for one in every)
+    verdict = {
+        "stated over expected, median": float(np.median(ratios)),
+        "the central 80 %": np.quantile(ratios, (0.1, 0.9)).tolist(),
+        "left": left,
+        "of": len(every),
+        "at most, with 95 %": binomial_interval(left, len(every), 0.9)[1],
+    }
+    console_output.print_texts_and_tables(verdict, width=170)
+    return verdict

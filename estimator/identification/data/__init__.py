@@ -1,0 +1,1 @@
+"""Records read: text tables, MAT files, sampling times, sensor faults."""

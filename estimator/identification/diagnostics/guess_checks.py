@@ -1,0 +1,169 @@
+"""Checks of the rig's guess: beside what was found, and beside what the records say without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.identification.fitting.multistart_search import SearchResult, search_coefficients
+from estimator.identification.identification_result import CheckFinding
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.rigs.rig_prior import STDS_PER_90_PERCENT, belief_from_moments
+
+#: Parameter to mean and standard deviation, in the rig's units.
+ParameterMoments = Mapping[str, tuple[float, float]]
+
+#: Parameter to its central 90 % interval.
+GuessIntervals = Mapping[str, tuple[float, float]]
+
+#: Standard deviations from the guess that are far.
+_MAX_STDS_FROM_GUESS = 5.0
+
+#: A guess leads astray where it moves a parameter by more than this part of it.
+_MAX_RELATIVE_SHIFT = 0.01
+
+#: A wrong step or scale is looked for that is nearer to a factor of 2, either way, than to 1, where the guess of the
+#: parameters that it changes has less than 1 % of a chance: chi square is larger, of so many of them.
+_MIN_LOG_FACTOR, _CHI_SQUARE_1_PERCENT = 0.5 * np.log(2), {2: 9.21, 3: 11.34, 4: 13.28}
+
+
+@dataclass(frozen=True)
+class _ScaleError:
+    """A number that may be wrong by a factor.
+
+    Attributes:
+        check_name: its name.
+        message: with a place for the factor.
+        exponents: parameter to the power of the factor that would mend it; the first one tells the factor.
+    """
+
+    check_name: str
+    message: str
+    exponents: Mapping[str, int]
+
+
+_STEP_MESSAGE = " would be those of the guess if the sampling step were about {:.2g} times the rig's"
+
+#: Kind of the output to what a wrong sampling step does: what the sensor shows keeps its scale, and not what is
+#: integrated or differentiated of it.
+_STEP_ERRORS = {
+    "displacement": _ScaleError("step", "m and c" + _STEP_MESSAGE, {"m": 2, "c": 1}),
+    "velocity": _ScaleError("step", "m, a and b" + _STEP_MESSAGE, {"m": 1, "a": -1, "b": -3}),
+    "acceleration": _ScaleError("step", "c, a and b" + _STEP_MESSAGE, {"a": -2, "b": -6, "c": -1}),
+}
+
+_CALIBRATION_ERRORS = (
+    _ScaleError(
+        "guess",
+        "m, c, a and b would be those of the guess if the input were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and those of the guess",
+        {"m": 1, "c": 1, "a": 1, "b": 1},
+    ),
+    _ScaleError(
+        "guess",
+        "m, c, a and b would be those of the guess if the output were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and those of the guess",
+        {"m": -1, "c": -1, "a": -1, "b": -3},
+    ),
+)
+
+
+def check_guess(guess: GuessIntervals, parameters: ParameterMoments, sensor_kind: str) -> list[CheckFinding]:
+    """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it.
+
+    Args:
+        guess: of the rig.
+        parameters: that were found.
+        sensor_kind: of the output.
+    """
+    if parameters["m"][0] <= 0:
+        return []
+    squared_deviations, warnings = _squared_deviations(guess, parameters), list[CheckFinding]()
+    far = [name for name, squared in squared_deviations.items() if squared > _MAX_STDS_FROM_GUESS**2]
+    if far:
+        message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
+        warnings = [CheckFinding("guess", message)]
+    least = sum(squared_deviations.values()) / 2
+    for scale_error in (_STEP_ERRORS[sensor_kind], *_CALIBRATION_ERRORS):
+        first = next(iter(scale_error.exponents))
+        ratio = sum(guess[first]) / 2 / parameters[first][0]
+        if ratio <= 0:
+            continue
+        factor = float(ratio ** (1 / scale_error.exponents[first]))
+        rescaled = {name: _scaled(parameters[name], factor ** scale_error.exponents.get(name, 0)) for name in guess}
+        remaining = sum(_squared_deviations(guess, rescaled).values())
+        unlikely = (
+            sum(squared_deviations[name] for name in scale_error.exponents)
+            > _CHI_SQUARE_1_PERCENT[len(scale_error.exponents)]
+        )
+        if abs(np.log(factor)) > _MIN_LOG_FACTOR and unlikely and remaining < least:
+            least, warnings = remaining, [CheckFinding(scale_error.check_name, scale_error.message.format(factor))]
+    return warnings
+
+
+def _squared_deviations(guess: GuessIntervals, parameters: ParameterMoments) -> dict[str, float]:
+    """Squared standard deviations between what is guessed of parameters and what was found."""
+    guess_stds = {name: (high - low) / 2 / STDS_PER_90_PERCENT for name, (low, high) in guess.items()}
+    return {
+        name: float((parameters[name][0] - sum(guess[name]) / 2) ** 2 / (spread**2 + parameters[name][1] ** 2))
+        for name, spread in guess_stds.items()
+    }
+
+
+def _scaled(parameter: tuple[float, float], factor: float) -> tuple[float, float]:
+    return parameter[0] * factor, parameter[1] * factor
+
+
+def fit_without_guess(problem: IdentificationProblem, search_result: SearchResult) -> tuple[ParameterMoments, float]:
+    """The parameters that the records alone give, and the nats by which the records are more probable with them.
+
+    Both fits are judged as if nothing were guessed, so that it does not count how improbable the guess holds them.
+    """
+    try:
+        result_without_guess = search_coefficients(
+            replace(problem, rig=replace(problem.rig, guess=None)), lambda share, at="": None
+        )
+    except ValueError:  # the records tell too little without a guess
+        return {}, 0.0
+    flat_prior_fitter = LaplaceFitter(search_result.fitter.problem, result_without_guess.fitter.prior)
+    free_energy_with_guess = flat_prior_fitter.fit(
+        [search_result.best], search_result.mean, search_result.sensor_std, iterations=0
+    ).free_energy[0]
+    moments = belief_from_moments(
+        problem.rig, problem.scales, *problem.moments_about_zero(result_without_guess.mean, result_without_guess.cov)
+    ).parameters()
+    return {name: (mean, std) for name, (mean, std, _) in moments.items()}, float(
+        free_energy_with_guess - result_without_guess.fits.free_energy.min()
+    )
+
+
+def is_shifted_by_guess(
+    guess: GuessIntervals, parameters: ParameterMoments, parameters_without_guess: ParameterMoments
+) -> bool:
+    """Whether the records alone say something else that matters."""
+    return any(
+        abs(parameters_without_guess[name][0] - parameters[name][0])
+        > _MAX_RELATIVE_SHIFT * abs(parameters_without_guess[name][0])
+        for name in guess
+    )
+
+
+def guess_conflict_findings(
+    guess: GuessIntervals,
+    parameters: ParameterMoments,
+    parameters_without_guess: ParameterMoments,
+    gain: float,
+    sensor_kind: str,
+) -> list[CheckFinding]:
+    """That the guess has led the fit astray: by so many nats the records are more probable with what they say alone."""
+    values = ", ".join(
+        f"{name} = {parameters_without_guess[name][0]:.4g} and not {parameters[name][0]:.4g}" for name in guess
+    )
+    conflict = f"the guess leads the fit astray: by {gain:.0f} nats the records speak for {values}"
+    why = check_guess(guess, parameters_without_guess, sensor_kind) or [
+        CheckFinding("guess", "check the units of guess and columns, or leave out the guess")
+    ]
+    return [CheckFinding(one.name, f"{conflict}; {one.message}") for one in why]

@@ -1,0 +1,200 @@
+"""How the input may have gone other than the rig says: between samples, with another delay, with a lag; by evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from estimator.identification.fitting.multistart_search import SearchResult
+from estimator.identification.identification_result import CheckFinding
+from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
+from estimator.identification.likelihood.laplace_fit import FitHypothesis, LaplaceFitter
+from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, INTERPOLATION_DEGREES, MAX_DELAY
+from estimator.support.array_types import FloatArray
+
+#: Nats by which another hypothesis must be better.
+MIN_EVIDENCE = 7.0
+
+#: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
+_NOISE_RATIO_FACTORS = (1.0, 0.1, 0.01)
+
+#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: these are
+#: coarse, and lead to the right one when records are identified again.
+_SMALL_DELAY_SHIFTS, _LARGE_DELAY_SHIFTS = (
+    range(-MAX_UNSTATED_DELAY, MAX_UNSTATED_DELAY + 1),
+    (5, 8, 12, 16, 20, 25, 30, 40),
+)
+
+#: Parts of a sample, and time constants of a lag in samples, that are tried first, and about what is best.
+_FIRST_DELAY_FRACTIONS, _FIRST_LAGS = (-0.5, 0.5), (0.5, 2.0)
+_REFINED_DELAY_FRACTIONS, _REFINED_LAGS = (-0.5, -0.25, 0.25, 0.5), (0.25, 0.5, 1.0, 2.0, 4.0)
+
+#: Digits of a delay and of a lag in samples that are told.
+_REPORTED_DIGITS = 2
+
+#: An input is smooth where its second differences are this much smaller than itself, as a root mean square.
+_MAX_ROUGHNESS = 0.7
+
+#: Steps of a fit of another hypothesis, at most.
+_MAX_FIT_STEPS = 12
+
+#: Samples of a record on which other hypotheses about the input are tried first, and the nats by which one that is
+#: given up is worse there.
+_SCREENING_SAMPLES, _SCREENING_LOSS = 1024, 10.0
+
+
+def check_input_path(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:
+    """What speaks for another path of the input, and which the rig should say."""
+    rig, baseline = problem.rig, float(search_result.fits.free_energy.min())
+    best = search_result.best
+    paths = [
+        name for name in FRACTIONAL_DELAY_INTERPOLATIONS[:2] if rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS
+    ] or [rig.interpolation]
+    others = [
+        replace(best, interpolation=path, delay=rig.delay + shift)
+        for path in paths
+        for shift in _SMALL_DELAY_SHIFTS
+        if (path, shift) != (rig.interpolation, 0)
+    ]
+    others += [replace(best, delay=rig.delay + shift) for shift in _LARGE_DELAY_SHIFTS]
+    # An accelerometer shows a held input itself: that it is sampled after this switches looks like a part of a sample.
+    in_parts = rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS and (
+        rig.output.kind != "acceleration" or _is_input_smooth(problem)
+    )
+    if in_parts:
+        others += [
+            replace(best, interpolation=path, delay=rig.delay + part)
+            for path in paths
+            for part in _FIRST_DELAY_FRACTIONS
+        ]
+    if rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS:
+        smooth = rig.interpolation != "spline" and not best.lag and _is_input_smooth(problem)
+        others += [replace(best, interpolation="spline")] if smooth else []
+    best_alternative = _best_alternative(problem, search_result, others, baseline)
+    if (
+        best_alternative is None or best_alternative[1] <= MIN_EVIDENCE
+    ) and rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS[:2]:
+        lagging = [replace(best, lag=best.lag + lag) for lag in _FIRST_LAGS]
+        if rig.interpolation == "linear" and not best.lag:  # what goes linearly resembles what is held and lags
+            lagging += [replace(best, interpolation="zero_order", delay=rig.delay - 1, lag=lag) for lag in _FIRST_LAGS]
+        best_alternative = _best_alternative(problem, search_result, lagging, baseline)
+    if best_alternative is None or best_alternative[1] <= MIN_EVIDENCE:
+        return []
+    alternative, gain = best_alternative
+    # Beside many samples parts of one are no matter, and what lags is not late by more than one.
+    if in_parts and abs(alternative.delay - rig.delay) <= 1:
+        alternative, gain = _refine_delay_and_lag(problem, search_result, alternative, gain, baseline)
+    return [_input_path_finding(problem, alternative, gain)]
+
+
+def _best_alternative(
+    problem: IdentificationProblem, search_result: SearchResult, hypotheses: Sequence[FitHypothesis], baseline: float
+) -> tuple[FitHypothesis, float] | None:
+    """The best of some hypotheses and its gain in nats; None where none can be."""
+    hypotheses = _screen_hypotheses(problem, search_result, [other for other in hypotheses if _is_allowed(other)])
+    if not hypotheses:
+        return None
+    gains = baseline - best_free_energies(search_result.fitter, hypotheses, search_result, baseline)
+    return hypotheses[int(np.argmax(gains))], float(gains.max())
+
+
+def _is_allowed(hypothesis: FitHypothesis) -> bool:
+    """Whether a rig may have it: an input that is held may act before the sample that it brings, others not."""
+    is_integer_delay = hypothesis.delay == int(hypothesis.delay)
+    minimum = (-1.0 if hypothesis.interpolation == "zero_order" else 0.0) if is_integer_delay else -0.999
+    return minimum <= hypothesis.delay <= MAX_DELAY and hypothesis.lag >= 0.0
+
+
+def _refine_delay_and_lag(
+    problem: IdentificationProblem, search_result: SearchResult, hypothesis: FitHypothesis, gain: float, baseline: float
+) -> tuple[FitHypothesis, float]:
+    """The delay in parts of a sample and the lag about a hypothesis, where these say more than whole samples do."""
+    paths = [*FRACTIONAL_DELAY_INTERPOLATIONS[:2], *(["spline"] if _is_input_smooth(problem) else [])]
+    middle = float(round(hypothesis.delay))
+    others = [
+        replace(hypothesis, interpolation=p, delay=middle + d, lag=0.0)
+        for p in paths
+        for d in (*_REFINED_DELAY_FRACTIONS, 0.0)
+    ]
+    others += [
+        replace(hypothesis, interpolation=p, delay=middle + d, lag=lag)
+        for p in FRACTIONAL_DELAY_INTERPOLATIONS[:2] for d in (-1.0, 0.0) for lag in _REFINED_LAGS
+    ]  # fmt: skip
+    refined = _best_alternative(problem, search_result, others, baseline)
+    if refined is None or refined[1] <= gain + MIN_EVIDENCE:
+        return hypothesis, gain
+    for width in (0.12, 0.06, 0.03):
+        incumbent = refined[0]
+        neighbours = [replace(incumbent, delay=incumbent.delay + d) for d in (-width, width)]
+        if incumbent.lag:
+            neighbours += [replace(incumbent, lag=incumbent.lag * (1 + d)) for d in (-2 * width, 2 * width)]
+        improved = _best_alternative(problem, search_result, neighbours, baseline)
+        if improved is not None and improved[1] > refined[1]:
+            refined = improved
+    final = replace(
+        refined[0], delay=round(refined[0].delay, _REPORTED_DIGITS), lag=round(refined[0].lag, _REPORTED_DIGITS + 1)
+    )
+    return final, refined[1]
+
+
+def _is_input_smooth(problem: IdentificationProblem) -> bool:
+    """Whether inputs change gently from sample to sample, as what a filter or an amplifier leaves of them."""
+    second_differences = np.concatenate([np.diff(u, 2) for u in problem.u])
+    first_differences = np.concatenate([np.diff(u) for u in problem.u])
+    # What is held for some samples stands still between its jumps.
+    is_held = np.mean(first_differences == 0.0) > 0.1
+    return bool(not is_held and np.sqrt(np.mean(second_differences**2)) < _MAX_ROUGHNESS * problem.input_rms)
+
+
+def _input_path_finding(problem: IdentificationProblem, alternative: FitHypothesis, gain: float) -> CheckFinding:
+    rig = problem.rig
+    name = "interpolation" if alternative.interpolation != rig.interpolation else "delay"
+    lag = f", and a lag of {alternative.lag * rig.step:.3g} s" if alternative.lag else ""
+    into = f"write these into the rig{', the lag into its [input]' if lag else ''}, and identify again"
+    message = (
+        f"the records speak for interpolation '{alternative.interpolation}' with delay {alternative.delay:g}{lag}, by "
+        f"{gain:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay:g}; {into}"
+    )
+    if rig.output.kind == "acceleration" and (rig.interpolation, alternative.interpolation) == ("zero_order", "linear"):
+        message += "; or make outputs missing where the input switches, if y shows it just after that"
+    return CheckFinding("lag" if alternative.lag and name == "delay" else name, message)
+
+
+def _screen_hypotheses(
+    problem: IdentificationProblem, search_result: SearchResult, hypotheses: list[FitHypothesis]
+) -> list[FitHypothesis]:
+    """Those that the first part of the records does not speak against; all, where that is no small part."""
+    shortened = problem.truncated(_SCREENING_SAMPLES)
+    if shortened.n_observed_outputs > problem.n_observed_outputs / 2 or not hypotheses:
+        return hypotheses
+    fitter = search_result.fitter.for_problem(shortened)
+    baseline = float(best_free_energies(fitter, [search_result.best], search_result, np.inf)[0])
+    worse = best_free_energies(fitter, hypotheses, search_result, baseline) - baseline
+    return [other for other, nats in zip(hypotheses, worse, strict=True) if nats < _SCREENING_LOSS]
+
+
+def best_free_energies(
+    fitter: LaplaceFitter, hypotheses: Sequence[FitHypothesis], search_result: SearchResult, give_up_above: float
+) -> FloatArray:
+    """(H,) free energies of other hypotheses, each in the best of some ratios of the noises.
+
+    Those whose samples are alike are fitted side by side: a spline takes more arithmetic than what is held, and parts
+    of samples are more samples.
+    """
+    result = np.full(len(hypotheses), np.inf)
+    groups: dict[tuple[int, bool], list[int]] = {}
+    for k, one in enumerate(hypotheses):
+        degree = INTERPOLATION_DEGREES["spline" if one.lag else one.interpolation]
+        groups.setdefault((max(degree, 1), one.delay == int(one.delay)), []).append(k)
+    start = np.append(search_result.mean, fitter.prior.mean[len(search_result.mean) :])
+    for group in groups.values():
+        variants = [
+            replace(hypotheses[k], noise_ratio=hypotheses[k].noise_ratio * part)
+            for k in group
+            for part in _NOISE_RATIO_FACTORS
+        ]
+        fits = fitter.fit(variants, start, search_result.sensor_std, _MAX_FIT_STEPS, give_up_above=give_up_above)
+        result[group] = fits.free_energy.reshape(-1, len(_NOISE_RATIO_FACTORS)).min(axis=1)
+    return result

@@ -1,0 +1,1 @@
+"""From nothing to a posterior: weak form, multistart, profile likelihood."""

@@ -1,0 +1,177 @@
+"""Beliefs of what a search left: the rig's own posterior, how it contracts, and that from a belief near it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from estimator.belief import Belief
+from estimator.ensemble import matched_gamma
+from estimator.identification.fitting.multistart_search import SearchResult, fit_noise_ratio
+from estimator.identification.likelihood.identification_problem import IdentificationProblem, mask_unexplained_outputs
+from estimator.identification.likelihood.initial_states import find_initial_states
+from estimator.identification.likelihood.laplace_fit import CoefficientPrior, FitHypothesis, LaplaceFitter
+from estimator.information import follow
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
+from estimator.rigs.rig import Rig
+from estimator.rigs.rig_prior import belief_from_moments
+from estimator.support.array_types import FloatArray
+
+#: Steps of integration a sample: enough for motions of a third of a period a sample, and always the same, so that a run
+#: compiles before it begins.
+_REFIT_SUBSTEPS = 16
+
+#: Factor of the ratio of the noises, either way, within which a search from a belief begins.
+_REFIT_RATIO_REACH = 3.0
+
+#: For its history the records are halved so often, and shorter ones are left out; and steps of a fit at most.
+_MAX_HALVINGS, _MIN_HISTORY_SAMPLES, _MAX_HISTORY_FIT_STEPS = 7, 50, 12
+
+#: Outputs that were used, with the mean and standard deviation of each parameter that they leave.
+ContractionHistory = tuple[tuple[int, dict[str, tuple[float, float]]], ...]
+
+
+def posterior_belief(
+    problem: IdentificationProblem, search_result: SearchResult
+) -> tuple[Belief, dict[str, tuple[float, float]]]:
+    """The posterior of the rig's own model, and the noises' standard deviations in its units."""
+    rig, scales = problem.rig, problem.scales
+    belief = belief_from_moments(rig, scales, *problem.moments_about_zero(search_result.mean, search_result.cov))
+    shapes = np.full(len(search_result.weights), problem.n_observed_outputs / 2)
+    gamma, xi = (matched_gamma(search_result.weights, shapes, shapes * noise**2) for noise in search_result.noises)
+    belief = Belief.of(
+        problem.belief_model, belief.mean, _with_initial_state_cov(belief, problem), gamma, xi, scales=scales
+    )
+    units = _unit_noise_force(belief), scales.output
+    noises = {
+        name: (float(search_result.weights @ values) * unit, _mixture_std(search_result.weights, values, shapes) * unit)
+        for name, values, unit in zip(("input", "output"), search_result.noises, units, strict=True)
+    }
+    return belief, noises
+
+
+def disturbance_std(belief: Belief) -> float:
+    """Of the force in every sample, as a standard deviation in the unit of the input."""
+    return _unit_noise_force(belief) * float(np.sqrt(belief.noises[1] / belief.noises[0]))
+
+
+def _unit_noise_force(belief: Belief) -> float:
+    """The input that moves the velocity, when it is held over a sample, as a process noise of 1 does."""
+    gain = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))["gain"]
+    return float(belief.scales.input * np.sqrt(3) / abs(gain))
+
+
+def _with_initial_state_cov(belief: Belief, problem: IdentificationProblem) -> FloatArray:
+    """The covariance, with a state that may be anywhere in the records' motion."""
+    cov, n = belief.cov, belief.model.n_states
+    cov[:n, :n] = problem.initial_state_cov + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
+    if DERIVATIVE_ORDER_OF_SENSOR[problem.rig.output.kind] == 0:
+        place = n + list(belief.model.coefficients).index("output_offset")
+        cov[0, 0] += cov[place, place]
+    return cov
+
+
+def one_step_forecasts(
+    search_result: SearchResult, belief: Belief, n_observed: int | None = None
+) -> tuple[FloatArray, ...]:
+    """Of each record (T, 2): mean and variance of each output before it was seen, in the rig's units.
+
+    Coefficients and noises are at their means, and a record begins in the motion that was found.
+
+    Args:
+        search_result: the result of the search.
+        belief: its posterior.
+        n_observed: outputs that are shown to the filter; all where it is None. The others it foresees from the inputs.
+    """
+    problem, best = search_result.fitter.problem, search_result.best
+    observed = tuple(
+        y if n_observed is None else np.where(np.arange(len(y)) < n_observed, y, np.nan) for y in problem.y
+    )
+    inputs, outputs, spans, places = replace(problem, y=observed).filter_samples(*best.input_path)
+    noises = problem.noises_of_records(belief.noises[None, 1::2] / belief.noises[None, ::2])
+    forecasts = np.empty((*outputs.shape, 2))
+    points = np.tile(search_result.mean, (len(inputs), 1))
+    follow(
+        problem.model,
+        points,
+        inputs,
+        outputs,
+        noises,
+        problem.initial_state_cov,
+        search_result.initial_states,
+        spans,
+        forecasts,
+    )
+    size = problem.scales.output
+    return tuple(
+        np.stack([(one[at, 0, 0] + problem.origin) * size, one[at, 0, 1] * size**2], axis=1)
+        for one, at in zip(forecasts, places, strict=True)
+    )
+
+
+def _mixture_std(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
+    mean = weights @ values
+    return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
+
+
+def contraction_history(
+    problem: IdentificationProblem, search_result: SearchResult, parameters: dict[str, tuple[float, float]]
+) -> ContractionHistory:
+    """The parameters that the first half of every record leaves, the first quarter, and so on; shortest first.
+
+    Each is a fit of its own from what all samples say, with the noises in the best ratio. One that runs away is left
+    out. Last come the ``parameters`` that all leave.
+    """
+    longest, history = max(len(u) for u in problem.u), []
+    for halvings in range(_MAX_HALVINGS, 0, -1):
+        count = longest >> halvings
+        if count < _MIN_HISTORY_SAMPLES:
+            continue
+        short = problem.truncated(count)
+        fits = search_result.fitter.for_problem(short).fit(
+            [search_result.best], search_result.mean, search_result.sensor_std, _MAX_HISTORY_FIT_STEPS
+        )
+        if fits.free_energy[0] < float("inf"):
+            belief = belief_from_moments(
+                problem.rig, problem.scales, *problem.moments_about_zero(fits.mean[0], fits.cov[0])
+            )
+            moments = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
+            history.append((short.n_observed_outputs, moments))
+    return (*history, (problem.n_observed_outputs, parameters))
+
+
+def refit_coefficients(
+    rig: Rig, records: Sequence[tuple[FloatArray, FloatArray]], prior: Belief, initial_belief: Belief
+) -> tuple[FloatArray, FloatArray]:
+    """Fit the coefficients to all records at once, from the belief of an estimator that took every sample once.
+
+    A Gaussian that takes every sample once becomes sure too soon where two coefficients at first show as one, such as
+    the cubic stiffness and the sensor's offset of a rig with two wells. All records at once do not.
+
+    Args:
+        rig: that they are of.
+        records: pairs (u, y) of arrays (T,) in the rig's units, paired by index; each may begin in any motion.
+        prior: what is believed before them.
+        initial_belief: the belief that the search begins at.
+
+    Returns:
+        Mean (K,) and covariance (K, K); those of ``initial_belief`` where the search leads nowhere.
+    """
+    start, cov = initial_belief.coefficients_mean, initial_belief.coefficients_cov
+    u = tuple(inputs / initial_belief.scales.input for inputs, _ in records)
+    y = tuple(mask_unexplained_outputs(outputs, rig) / initial_belief.scales.output for _, outputs in records)
+    problem = IdentificationProblem(rig, initial_belief.scales, u, y, substeps=_REFIT_SUBSTEPS)
+    if list(problem.model.coefficients) != list(initial_belief.model.coefficients):
+        return start, cov
+    q, r = initial_belief.noises[1] / initial_belief.noises[0], initial_belief.noises[3] / initial_belief.noises[2]
+    fitter = LaplaceFitter(problem, CoefficientPrior.of(prior.coefficients_mean, prior.coefficients_cov))
+    hypothesis = FitHypothesis(rig.interpolation, rig.delay, float(np.sqrt(q / r)), lag=problem.lag)
+    level = float(np.sqrt(r))
+    hypothesis = replace(hypothesis, initial_states=find_initial_states(problem, hypothesis, start[None], level)[0])
+    try:
+        search_result = fit_noise_ratio(fitter, hypothesis, start, level, _REFIT_RATIO_REACH)
+    except ValueError:
+        return start, cov
+    return search_result.mean, search_result.cov

@@ -1,0 +1,1 @@
+"""The likelihood of records under a model, and its initial states."""

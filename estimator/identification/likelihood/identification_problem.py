@@ -1,0 +1,349 @@
+"""The records of an identification, as the engine takes them: scaled, with all ways that the input may have gone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.identification.data.nonuniform_sampling import resample_on_knots
+from estimator.inputs import feed
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
+from estimator.models.model import Model
+from estimator.rigs.rig import INTERPOLATION_DEGREES, Channel, Rig
+from estimator.rigs.units import Scales
+from estimator.support.array_types import FloatArray
+
+#: Samples by which the input may be later than the rig says: a check looks for it.
+MAX_UNSTATED_DELAY = 3
+
+#: Parameters that an identification is for; the others are what a channel adds.
+TARGET_PARAMETERS = tuple(PARAMETER_DIMENSIONS)
+
+#: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
+OPTIONAL_TERMS = ("cubic_damping", "quintic", "dry_friction")
+
+
+#: Speed below which dry friction fades, in parts of the usual one.
+_CREEP_SPEED_FRACTION = 0.05
+
+#: Samples of a gap that is bridged before it is known how long a period is.
+_MAX_BRIDGED_GAP = 16
+
+#: Inputs of a piece are few where they have less than so much of the power of the strongest, and all of them where they
+#: have more than so much.
+_WEAK_INPUT_POWER, _STRONG_INPUT_POWER = 0.25, 0.98
+
+
+class FilterSamples(NamedTuple):
+    """Records as a filter takes them; a shorter one ends with NaN.
+
+    Attributes:
+        inputs: (records, N, rows) what acts over each sample.
+        outputs: (records, N, 1) at its end.
+        spans: (records, N) its length in sampling steps; None where all are one step.
+        output_indices: of each record, (T,) the sample that ends with each of its outputs.
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    spans: FloatArray | None
+    output_indices: tuple[npt.NDArray[np.intp], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationProblem:
+    """Records to identify a rig from.
+
+    Attributes:
+        rig: as it was given.
+        scales: that the records are in.
+        u: inputs of each record, in parts of their scale.
+        y: outputs of each record, in parts of theirs, counted from the origin, NaN where one is missing.
+        origin: where outputs are counted from, in parts of their scale: about their middle, where that is far from 0.
+        substeps: steps of integration a sample.
+        optional_terms: of the equation, beside those of Eq. (1) and the offsets; some of `OPTIONAL_TERMS`.
+        times: of the samples of each record, in sampling steps from its first on; None where these are one step apart.
+        record_noise_scales: of each record, the noises in parts of what they are on the whole; None where they are alike.
+    """
+
+    rig: Rig
+    scales: Scales
+    u: tuple[FloatArray, ...]
+    y: tuple[FloatArray, ...]
+    origin: float = 0.0
+    substeps: int = 2
+    optional_terms: tuple[str, ...] = ()
+    times: tuple[FloatArray, ...] | None = None
+    record_noise_scales: FloatArray | None = None
+
+    @cached_property
+    def model(self) -> Model:
+        """The rig's own, with the terms."""
+        more: dict[str, Any] = dict.fromkeys(self.optional_terms, True)
+        model = duffing(offsets=True, sensor=self.rig.output.kind, **more)
+        return replace(model, substeps=self.substeps)
+
+    @property
+    def belief_model(self) -> Model:
+        """The rig's own, of which the belief is; integrated as `model` is, where that is finer."""
+        own = self.rig.model
+        return replace(own, substeps=self.substeps) if self.substeps > own.substeps else own
+
+    @property
+    def n_observed_outputs(self) -> int:
+        """Outputs that were seen."""
+        return int(sum(np.isfinite(y).sum() for y in self.y))
+
+    @property
+    def lag(self) -> float:
+        """Time constant of the input's lag, in sampling steps, as the rig says."""
+        return (self.rig.input.lag or 0.0) / self.rig.step
+
+    def noises_of_records(self, noises: FloatArray) -> FloatArray:
+        """(series, 2) variances of both noises in every record, of those on the whole (n, 2): record after record."""
+        record_scales = np.ones(len(self.u)) if self.record_noise_scales is None else self.record_noise_scales
+        return (noises[:, None] * record_scales[:, None] ** 2).reshape(-1, noises.shape[1])
+
+    def filter_samples(self, interpolation: str, delay: float, lag: float = 0.0) -> FilterSamples:
+        """The records, if the input went so; every sample is one step long where that is enough."""
+        rows = 1 + max(INTERPOLATION_DEGREES[name] for name in ("linear", self.rig.interpolation, interpolation))
+        if self.times is None and delay == int(delay) and not lag:
+            # A record's first output comes before its first input acts, however the input goes.
+            rig = replace(self.rig, interpolation=interpolation, delay=int(delay), input=Channel())
+            inputs = _stack_padded([filter_input_rows(self.model, rig, u) for u in self.u], rows)
+            places = tuple(np.arange(len(y)) for y in self.y)
+            return FilterSamples(inputs, _stack_padded([y[:, None] for y in self.y], 1), None, places)
+        laid_records = [
+            resample_on_knots(times, u, y, interpolation, delay, lag)
+            for times, u, y in zip(self.times_in_steps, self.u, self.y, strict=True)
+        ]
+        rows = max(rows, *(one.inputs.shape[1] for one in laid_records))
+        spans = _stack_padded([one.spans[:, None] for one in laid_records], 1)[:, :, 0]
+        return FilterSamples(
+            _stack_padded([one.inputs for one in laid_records], rows),
+            _stack_padded([one.outputs[:, None] for one in laid_records], 1),
+            spans,
+            tuple(one.output_indices for one in laid_records),
+        )
+
+    @property
+    def times_in_steps(self) -> tuple[FloatArray, ...]:
+        """Times of the samples of each record, in sampling steps."""
+        return self.times or tuple(np.arange(len(u), dtype=np.float64) for u in self.u)
+
+    def resampled_evenly(self) -> IdentificationProblem:
+        """The same with outputs and inputs in between, one step apart: enough to find a start."""
+        if self.times is None:
+            return self
+        u, y = [], []
+        for times, inputs, outputs in zip(self.times_in_steps, self.u, self.y, strict=True):
+            at, seen = np.arange(int(times[-1]) + 1.0), np.isfinite(outputs)
+            u.append(inputs[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)])
+            y.append(np.interp(at, times[seen], outputs[seen]))
+        return replace(self, u=tuple(u), y=tuple(y), times=None)
+
+    def moments_about_origin(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
+        return _shift_output_origin(self.model, mean, cov, self.origin)
+
+    def moments_about_zero(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The moments of which `moments_about_origin` makes these."""
+        return _shift_output_origin(self.model, mean, cov, -self.origin)
+
+    def truncated(self, max_samples: int) -> IdentificationProblem:
+        """The same with the first samples of each record only."""
+        return self.with_segments([(record, 0) for record in range(len(self.u))], max_samples)
+
+    def with_segments(self, segments: Sequence[tuple[int, int]], max_samples: int) -> IdentificationProblem:
+        """The same with pieces of records in their place, each of so many samples at most.
+
+        Args:
+            segments: the number of a record, and the sample that the piece begins with.
+            max_samples: of each.
+        """
+        u, y, times = [], [], []
+        for record, first_sample in segments:
+            inside = slice(first_sample, first_sample + max_samples)
+            u.append(self.u[record][inside])
+            y.append(
+                mask_unexplained_outputs(self.y[record][inside], self.rig, MAX_UNSTATED_DELAY)
+                if first_sample
+                else self.y[record][inside]
+            )
+            times.append(self.times_in_steps[record][inside])
+        evenly = None if self.times is None else tuple(one - one[0] for one in times)
+        return replace(self, u=tuple(u), y=tuple(y), times=evenly)
+
+    def most_driven_segments(self, segment_length: int) -> list[tuple[int, int]]:
+        """Of each record, its number and the sample that a piece of so many begins with, which shows what an input did.
+
+        It is the first, unless the input is far stronger elsewhere: the last piece that holds the strongest inputs, and
+        some of what was before them.
+        """
+        segments = []
+        for record, (u, y) in enumerate(zip(self.u, self.y, strict=True)):
+            power = _sliding_sums((u - u.mean()) ** 2, segment_length) * _sliding_sums(
+                np.isfinite(y).astype(float), segment_length
+            )
+            begin = 0
+            if power[0] < _WEAK_INPUT_POWER * power.max():
+                begin = max(0, int(np.flatnonzero(power > _STRONG_INPUT_POWER * power.max())[-1]) - segment_length // 8)
+            segments.append((record, begin))
+        return segments
+
+    def largest_output_segment(self, segment_length: int) -> tuple[int, int]:
+        """The number of a record, and the sample that a piece of so many begins with, of the largest outputs."""
+        powers = [_sliding_sums(np.nan_to_num(y) ** 2, segment_length) for y in self.y]
+        record = int(np.argmax([power.max() for power in powers]))
+        return record, int(powers[record].argmax())
+
+    @cached_property
+    def is_free_decay(self) -> bool:
+        """Whether no input acts: then m is no matter of the records, and counts as 1 in the unit of the scales."""
+        return not any(u.any() for u in self.u)
+
+    @cached_property
+    def output_rms(self) -> float:
+        """Root mean square of the outputs about their mean."""
+        seen = np.concatenate([y[np.isfinite(y)] for y in self.y])
+        return float(max(seen.std(), 1e-12))
+
+    @cached_property
+    def input_rms(self) -> float:
+        """Root mean square of the inputs."""
+        return float(max(np.sqrt(np.mean(np.concatenate(self.u) ** 2)), 1e-12))
+
+    @cached_property
+    def mean_frequency(self) -> float:
+        """Where the outputs have their power: the mean angular frequency [rad per sample], robust to white noise."""
+        power = total = 0.0
+        for y in self.resampled_evenly().y:
+            whole = interpolate_gaps(y, _MAX_BRIDGED_GAP)
+            whole = np.where(np.isfinite(whole), whole, np.nanmean(y))
+            spectrum = np.abs(np.fft.rfft(whole - whole.mean())) ** 2
+            floor = 2 * np.median(spectrum)
+            spectrum = np.where(spectrum > 20 * floor, spectrum, 0.0)
+            power += float(spectrum.sum())
+            total += float(spectrum @ np.linspace(0, np.pi, len(spectrum)))
+        return float(np.clip(total / power if power > 0 else 0.1, 2e-3, 2.5))
+
+    @cached_property
+    def displacement(self) -> float:
+        """Root mean square of the displacement inside, as far as the frequency tells."""
+        return self.output_rms / self.mean_frequency ** DERIVATIVE_ORDER_OF_SENSOR[self.rig.output.kind]
+
+    @cached_property
+    def max_state(self) -> FloatArray:
+        """(2,) the largest displacement and velocity of a sample, as far as the frequency tells."""
+        x = (
+            max(float(np.nanmax(np.abs(y))) for y in self.y)
+            / self.mean_frequency ** DERIVATIVE_ORDER_OF_SENSOR[self.rig.output.kind]
+        )
+        return np.array([x, x * max(self.mean_frequency, 0.1)])
+
+    @property
+    def initial_state_cov(self) -> FloatArray:
+        """(2, 2) covariance of the state before a record: it may begin in any motion."""
+        return np.diag((3 * self.max_state) ** 2)
+
+    def natural_coefficient_sizes(self) -> dict[str, float]:
+        """Sizes of the coefficients at which each term is as large as the others."""
+        w, x = self.mean_frequency, self.displacement
+        sizes = {
+            "stiffness": w**2,
+            "cubic": w**2 / x**2,
+            "damping": w,
+            "gain": 1.0 if self.is_free_decay else w**2 * x / self.input_rms,
+        }
+        sizes |= {"force": w**2 * x, "output_offset": self.output_rms}
+        return sizes | {"cubic_damping": w / (w * x) ** 2, "quintic": w**2 / x**4, "friction": w**2 * x}
+
+    def term_prior(self, term: str) -> list[tuple[float, float]]:
+        """Mean and standard deviation of each coefficient that a term of `OPTIONAL_TERMS` brings."""
+        if term != "dry_friction":
+            return [(0.0, self.natural_coefficient_sizes()[term])]
+        # The speed below which friction fades is no matter of the records: a small part of the usual speed.
+        creep = _CREEP_SPEED_FRACTION * self.mean_frequency * self.displacement
+        return [(0.0, self.natural_coefficient_sizes()["friction"]), (creep, 0.01 * creep)]
+
+
+def interpolate_gaps(y: FloatArray, max_gap: float) -> FloatArray:
+    """Outputs (T,) with straight lines through gaps of no more than so many samples.
+
+    Example:
+        >>> interpolate_gaps(np.array([0.0, np.nan, 2.0, np.nan, np.nan, 5.0, np.nan]), 1)
+        array([ 0.,  1.,  2., nan, nan,  5., nan])
+    """
+    observed = np.flatnonzero(np.isfinite(y))
+    filled = y.copy()
+    gaps = np.diff(observed) - 1
+    for gap in np.flatnonzero((gaps > 0) & (gaps <= max_gap)):
+        before, after = observed[gap], observed[gap + 1]
+        filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
+    return filled
+
+
+def _sliding_sums(values: FloatArray, samples: int) -> FloatArray:
+    """Sums of pieces of so many values, one for each place where a piece may begin."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    samples = min(samples, len(values))
+    return np.asarray(sums[samples:] - sums[: len(sums) - samples])
+
+
+def mask_unexplained_outputs(y: FloatArray, rig: Rig, extra_delay: int = 0) -> FloatArray:
+    """Outputs (T,) of a record, NaN where inputs acted that came before it and that nobody recorded.
+
+    What these had done before the first output that is left does not count: the oscillator may be in any motion.
+
+    Args:
+        y: outputs.
+        rig: whose they are.
+        extra_delay: samples by which the input may be later than the rig says.
+    """
+    # An accelerometer shows the force itself, not only what it did.
+    n_masked = max(0, math.ceil(rig.delay)) + extra_delay + (DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind] == 2)
+    masked = y.copy()
+    masked[: min(n_masked, len(y) - 1)] = np.nan
+    return masked
+
+
+def filter_input_rows(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
+    """(T, rows) what a model takes over the sample before each output; after the last input it stays the same."""
+    input_feed = feed(model, rig)
+    if input_feed.at_once:
+        return input_feed.pieces(u)
+    window = input_feed.stencil.shape[1]
+    lag = -1 if input_feed.waits else input_feed.past - (window - 1)
+    places = np.arange(len(u))[:, None] - lag - (window - 1) + np.arange(window)
+    acting = u[np.clip(places, 0, len(u) - 1)]
+    if not input_feed.fills:
+        acting = np.where(places < 0, 0.0, acting)
+    return np.asarray(acting @ input_feed.stencil.T)
+
+
+def _shift_output_origin(
+    model: Model, mean: FloatArray, cov: FloatArray, origin: float
+) -> tuple[FloatArray, FloatArray]:
+    """Moments where outputs are counted from another origin, of a displacement: z'' = force - stiffness z + ..."""
+    jacobian, offset = np.eye(len(mean)), np.zeros(len(mean))
+    names = list(model.coefficients)
+    jacobian[names.index("force"), names.index("stiffness")] = -origin
+    offset[names.index("output_offset")] = -origin
+    shifted_cov = jacobian @ cov @ jacobian.T
+    # An inverse of what is nearly singular, such as what few samples tell, is symmetric to fewer digits than it has.
+    return jacobian @ mean + offset, (shifted_cov + shifted_cov.T) / 2
+
+
+def _stack_padded(series: list[FloatArray], columns: int) -> FloatArray:
+    """(n, T, columns) of n series: columns that one lacks are 0, and a shorter one ends with NaN."""
+    stacked = np.full((len(series), max(map(len, series)), columns), np.nan)
+    for row, one in zip(stacked, series, strict=True):
+        row[: len(one)] = 0.0
+        row[: len(one), : one.shape[1]] = one
+    return stacked

@@ -1,0 +1,130 @@
+"""The motion that each record begins in.
+
+The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
+accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
+noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before;
+unless all of the record is explained far better by where it began then, or by rest, in each of the wells too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from estimator.identification.fitting.weak_form import well_displacements
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.laplace_fit import FitHypothesis
+from estimator.information import follow
+from estimator.support.array_types import FloatArray
+
+#: A grid of so many displacements and velocities each, up to so much of the largest, is looked at first. What is judged
+#: is the first period of a record, of so many samples at least and at most.
+_GRID_POINTS, _GRID_EXTENT, _JUDGED_SAMPLES_BOUNDS = 11, 1.5, (16, 256)
+
+#: Series that are judged at once, about.
+_MAX_SERIES_PER_BATCH = 2048
+
+#: With noises of at least so much of the output a filter comes to the motion from the nearest place of the grid, though
+#: the oscillator is not linear. Newton's method takes so many steps with them, and so many with the noises as they are.
+_COARSE_SENSOR_FRACTION, _NEWTON_STEPS = 0.3, (4, 6)
+
+#: Nats by which another motion must be better. A few do not tell: the filter is not linear about the same place.
+_MIN_GAIN = 10.0
+
+#: Distance of finite differences, and the longest step, in parts of the largest.
+_FINITE_DIFFERENCE_STEP, _MAX_NEWTON_STEP = 1e-3, 0.3
+
+#: Parts of Newton's step that are tried.
+_LINE_SEARCH_FRACTIONS = np.array([1.0, 0.3, 0.1, 0.01])
+
+#: Offsets of the points whose losses tell slope and curvature by x and v.
+_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
+
+
+def find_initial_states(
+    problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, sensor_std: float
+) -> FloatArray:
+    """The most probable displacement and velocity a sample before each record.
+
+    Args:
+        problem: the records.
+        hypothesis: about the input and the noises, with the motions that were found before.
+        points: (P, K) coefficients.
+        sensor_std: σ_v.
+
+    Returns:
+        (P, records, 2), scaled.
+    """
+    period = 2 * np.pi / problem.mean_frequency
+    first_period = problem.truncated(int(np.clip(period, *_JUDGED_SAMPLES_BOUNDS)))
+    grid_axis = np.linspace(-_GRID_EXTENT, _GRID_EXTENT, _GRID_POINTS)
+    grid = np.stack(np.meshgrid(grid_axis, grid_axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+    series, unit = np.arange(len(points) * len(problem.u)), problem.max_state
+
+    losses = _initial_state_loss(first_period, hypothesis, points, np.zeros((2, 2)))
+    coarse_sensor_std = max(sensor_std, _COARSE_SENSOR_FRACTION * problem.output_rms)
+    # In parts, where many records make many series.
+    parts = np.array_split(np.repeat(grid, len(series), axis=1), -(-len(series) * len(grid) // _MAX_SERIES_PER_BATCH))
+    found = grid[np.concatenate([losses(unit * part, coarse_sensor_std) for part in parts]).argmin(axis=0), 0]
+    for sensor in np.repeat([coarse_sensor_std, sensor_std], _NEWTON_STEPS):
+        stencil_losses = losses(unit * (found + _FINITE_DIFFERENCE_STEP * _STENCIL[:, None]), sensor)
+        candidates = found + _LINE_SEARCH_FRACTIONS[:, None, None] * _newton_step(stencil_losses)
+        candidate_losses = losses(unit * candidates, sensor)
+        best = candidate_losses.argmin(axis=0)
+        found = np.where((candidate_losses[best, series] < stencil_losses[0])[:, None], candidates[best, series], found)
+    rest = np.zeros_like(found)
+    previous = rest if hypothesis.initial_states is None else np.tile(hypothesis.initial_states, (len(points), 1))
+    equilibria = np.repeat(well_displacements(problem, points), len(problem.u), axis=1)
+    options = np.stack([unit * found, previous, rest, *(np.stack([x, np.zeros_like(x)], axis=1) for x in equilibria)])
+    option_losses = _initial_state_loss(problem, hypothesis, points, problem.initial_state_cov)(options, sensor_std)
+    option_losses[0] -= _MIN_GAIN
+    return np.asarray(options[option_losses.argmin(axis=0), series]).reshape(len(points), -1, 2)
+
+
+def _newton_step(stencil_losses: FloatArray) -> FloatArray:
+    """(records, 2) steps to the minimum of parabolas through losses at `_STENCIL`; downhill where they have none."""
+    here, right, left, up, down, both, neither = stencil_losses
+    with np.errstate(invalid="ignore"):  # infinite where the numbers ran away
+        slope = np.stack([right - left, up - down], axis=1) / (2 * _FINITE_DIFFERENCE_STEP)
+        xx, vv = right - 2 * here + left, up - 2 * here + down
+        xv = (both + neither - right - left - up - down + 2 * here) / 2
+        curvature = (
+            np.stack([np.stack([xx, xv], axis=1), np.stack([xv, vv], axis=1)], axis=1) / _FINITE_DIFFERENCE_STEP**2
+        )
+    finite = np.isfinite(curvature).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1)
+    slope[~finite], curvature[~finite] = 0.0, np.eye(2)
+    values, eigenvectors = np.linalg.eigh(curvature)
+    values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max(axis=1, keepdims=True) + 1e-300)
+    step = -np.einsum("rij,rj,rkj,rk->ri", eigenvectors, 1 / values, eigenvectors, slope)
+    length = np.abs(step).max(axis=1, keepdims=True)
+    return np.asarray(step * np.minimum(1.0, _MAX_NEWTON_STEP / np.maximum(length, 1e-300)))
+
+
+def _initial_state_loss(
+    problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, cov: FloatArray
+) -> Callable[[FloatArray, float], FloatArray]:
+    """Candidates (C, S, 2) and σ_v to minus the log likelihoods (C, S) of what begins there, within cov.
+
+    Each of the S series is a record at one of the points (P, K).
+    """
+    inputs, outputs, spans, _ = problem.filter_samples(*hypothesis.input_path)
+    ratio = hypothesis.noise_ratio
+    at = np.repeat(points, len(inputs), axis=0)
+
+    def losses(candidates: FloatArray, sensor: float) -> FloatArray:
+        count, series = candidates.shape[:2]
+        times = count * series // len(inputs)
+        loss = follow(
+            problem.model,
+            np.tile(at, (count, 1)),
+            np.tile(inputs, (times, 1, 1)),
+            np.tile(outputs, (times, 1, 1)),
+            problem.noises_of_records(np.tile([(ratio * sensor) ** 2, sensor**2], (times, 1))),
+            cov,
+            candidates.reshape(-1, 2),
+            None if spans is None else np.tile(spans, (times, 1)),
+        ).loss
+        return np.where(np.isfinite(loss), loss, np.inf).reshape(count, series)
+
+    return losses

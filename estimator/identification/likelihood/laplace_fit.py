@@ -1,0 +1,377 @@
+"""Many hypotheses about the same records, each fitted to its most probable coefficients, in a lane of its own.
+
+A hypothesis says how the input went between samples, with which delay, which terms the equation has, and how the two
+noises share what the outputs show: σ_w/σ_v. With the Kalman filter's innovations ν_t and their variances S_t at the
+coefficients ψ it is judged by the free energy of a Gaussian at the minimum (variational Laplace),
+
+    L = ½ Σ_t (ν_t²/S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0),    F = L + ½ log det(Λ0 + I) - ½ log det Λ0,
+
+with the information I of `estimator.information`. The level of the noises is not searched: S grows with it as a whole,
+so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (Σ log S + N log(Σ ν²/S / N) + N). The
+first outputs of a record, as many as there are states, do not count: any motion may have been before them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.identification.likelihood.identification_problem import FilterSamples, IdentificationProblem
+from estimator.information import Followed, follow
+from estimator.support.array_types import FloatArray
+
+#: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
+#: up.
+_INITIAL_DAMPING, _DAMPING_INCREASE, _DAMPING_DECREASE, _MIN_DAMPING, _MAX_DAMPING = 1e-6, 30.0, 0.1, 1e-9, 1e2
+
+#: A step that promises to lower the loss by less is the last of a fit [nats]: it is a seventh of a standard deviation,
+#: of which it leaves a small part.
+_MIN_PROMISED_GAIN = 1e-2
+
+#: So many times what the last step gained is what a fit may still gain.
+_REMAINING_GAIN_FACTOR = 10.0
+
+
+@dataclass(frozen=True)
+class FitHypothesis:
+    """What is held for true while the coefficients are fitted.
+
+    Attributes:
+        interpolation: of the input.
+        delay: of the input, in samples.
+        lag: time constant of a first-order lag of the input, in samples.
+        noise_ratio: σ_w/σ_v inside.
+        initial_states: (records, 2) displacement and velocity a sample before each record, about which the filter is linear at
+            its first samples; at rest where it is None.
+    """
+
+    interpolation: str
+    delay: float
+    noise_ratio: float = 1.0
+    initial_states: FloatArray | None = field(default=None, compare=False)
+    lag: float = 0.0
+
+    @property
+    def input_path(self) -> tuple[str, float, float]:
+        """How the input went: interpolation, delay and lag."""
+        return self.interpolation, self.delay, self.lag
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientPrior:
+    """A Gaussian over the coefficients of `Problem.model`: mean (K,) and precision (K, K)."""
+
+    mean: FloatArray
+    precision: FloatArray
+
+    @classmethod
+    def of(cls, mean: FloatArray, cov: FloatArray) -> CoefficientPrior:
+        """That of given moments (K,) and (K, K)."""
+        scale = np.sqrt(np.diag(cov))
+        return cls(mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
+
+    def extended(self, moments: Sequence[tuple[float, float]]) -> CoefficientPrior:
+        """With more coefficients, of means and standard deviations."""
+        n, means, stds = len(self.mean), [mean for mean, _ in moments], np.array([std for _, std in moments])
+        precision = np.zeros((n + len(stds),) * 2)
+        precision[:n, :n], precision[n:, n:] = self.precision, np.diag(stds**-2)
+        return CoefficientPrior(np.append(self.mean, means), precision)
+
+
+@dataclass(frozen=True, eq=False)
+class LaplaceFits:
+    """What became of H hypotheses.
+
+    Attributes:
+        hypotheses: in order.
+        mean: (H, K) most probable coefficients.
+        cov: (H, K, K) their covariance.
+        sensor_std: (H,) σ_v.
+        free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away, or the records and
+            the prior leave a coefficient open.
+        loss: (H,) the part of it that is L.
+    """
+
+    hypotheses: tuple[FitHypothesis, ...]
+    mean: FloatArray
+    cov: FloatArray
+    sensor_std: FloatArray
+    free_energy: FloatArray
+    loss: FloatArray
+
+    def best(self, count: int) -> LaplaceFits:
+        """Those of the lowest free energies, the lowest first."""
+        return self.where(np.argsort(self.free_energy, kind="stable")[:count])
+
+    def where(self, chosen: npt.NDArray[Any]) -> LaplaceFits:
+        """Those of some hypotheses, told by their numbers or by flags."""
+        kept = tuple(self.hypotheses[i] for i in np.arange(len(self.hypotheses))[chosen])
+        parts = (self.mean, self.cov, self.sensor_std, self.free_energy, self.loss)
+        return LaplaceFits(kept, *(part[chosen] for part in parts))
+
+    @classmethod
+    def concatenated(cls, batches: Sequence[LaplaceFits]) -> LaplaceFits:
+        """All of several."""
+        parts = zip(*((f.mean, f.cov, f.sensor_std, f.free_energy, f.loss) for f in batches), strict=True)
+        return cls(tuple(h for f in batches for h in f.hypotheses), *(np.concatenate(part) for part in parts))
+
+
+class _FilterInputs(NamedTuple):
+    """What does not move in a fit of H hypotheses of G kinds: how the input went, and with which delay.
+
+    Attributes:
+        input_path_index: (H,) of each.
+        inputs: (G, records, N, rows).
+        outputs: (G, records, N, 1).
+        spans: (G, records, N), or None.
+        noise_ratios: (H,).
+        initial_states: (H, records, 2).
+    """
+
+    input_path_index: npt.NDArray[np.intp]
+    inputs: FloatArray
+    outputs: FloatArray
+    spans: FloatArray | None
+    noise_ratios: FloatArray
+    initial_states: FloatArray
+
+    def of(self, chosen: npt.NDArray[np.intp]) -> _FilterInputs:
+        """That of some hypotheses."""
+        return self._replace(
+            input_path_index=self.input_path_index[chosen],
+            noise_ratios=self.noise_ratios[chosen],
+            initial_states=self.initial_states[chosen],
+        )
+
+
+def _pad_series(series: FloatArray, n_samples: int, n_rows: int | None = None) -> FloatArray:
+    """(records, N, ...) made longer with NaN, and wider with zeros."""
+    missing = n_samples - series.shape[1]
+    if n_rows is not None:
+        series = np.pad(series, ((0, 0), (0, 0), (0, n_rows - series.shape[2])))
+    return (
+        np.pad(series, ((0, 0), (0, missing), *([(0, 0)] * (series.ndim - 2))), constant_values=np.nan)
+        if missing
+        else series
+    )
+
+
+class LaplaceFitter:
+    """Fits hypotheses about a problem.
+
+    Args:
+        problem: the records.
+        prior: of the coefficients.
+    """
+
+    def __init__(self, problem: IdentificationProblem, prior: CoefficientPrior) -> None:
+        self.problem, self.prior = problem, prior
+        self._scale = 1 / np.sqrt(np.diag(prior.precision))
+        self._samples: dict[tuple[str, float, float], FilterSamples] = {}
+
+    def for_problem(self, problem: IdentificationProblem) -> LaplaceFitter:
+        """The same for other records."""
+        return LaplaceFitter(problem, self.prior)
+
+    def fit(
+        self,
+        hypotheses: Sequence[FitHypothesis],
+        initial_coefficients: FloatArray,
+        initial_sensor_std: FloatArray | float,
+        iterations: int = 30,
+        give_up_above: float = np.inf,
+        fixed_directions: FloatArray | None = None,
+    ) -> LaplaceFits:
+        """Fit each hypothesis by damped Gauss-Newton steps (Levenberg and Marquardt).
+
+        Args:
+            hypotheses: H of them.
+            initial_coefficients: (K,) or (H, K) coefficients to begin with.
+            initial_sensor_std: (H,) or one: σ_v to begin with.
+            iterations: at most.
+            give_up_above: a free energy; a hypothesis that cannot come below it is given up.
+            fixed_directions: (H, K) directions: no step changes their products with the coefficients. Covariances and free
+                energies are as if nothing were pinned.
+        """
+        count, k = len(hypotheses), len(self._scale)
+        points = np.broadcast_to(initial_coefficients, (count, k)).copy()
+        scaled_directions = None if fixed_directions is None else fixed_directions * self._scale
+        sensor_stds = np.broadcast_to(np.asarray(initial_sensor_std, dtype=np.float64), count)
+        filter_inputs = self._filter_inputs(hypotheses)
+        loss, gradient, curvature, sensor_stds = self._loss_and_derivatives(points, filter_inputs, sensor_stds)
+        damping = np.full(count, _INITIAL_DAMPING)
+        active = np.flatnonzero(np.isfinite(loss))
+        for _ in range(iterations):
+            if not len(active):
+                break
+            damped = curvature[active] + (damping[active, None] * np.einsum("hii->hi", curvature[active]))[
+                :, :, None
+            ] * np.eye(k)
+            step = -(
+                solve_batch(damped, gradient[active])
+                if scaled_directions is None
+                else _solve_with_fixed_directions(damped, gradient[active], scaled_directions[active])
+            )
+            promised = -0.5 * np.einsum("hk,hk->h", gradient[active], step)
+            trial = points[active] + self._scale * step
+            found = self._loss_and_derivatives(trial, filter_inputs.of(active), sensor_stds[active])
+            better = found[0] <= loss[active]  # False for what is not finite
+            gained = np.where(better, loss[active] - found[0], promised)
+            accepted = active[better]
+            points[accepted] = trial[better]
+            loss[accepted], gradient[accepted], curvature[accepted], sensor_stds[accepted] = (
+                values[better] for values in found
+            )
+            damping[active] = np.where(
+                better,
+                np.maximum(_DAMPING_DECREASE * damping[active], _MIN_DAMPING),
+                _DAMPING_INCREASE * damping[active],
+            )
+            is_finished = (
+                (promised < _MIN_PROMISED_GAIN)
+                | (damping[active] > _MAX_DAMPING)
+                | (self._free_energy(loss[active], curvature[active]) - _REMAINING_GAIN_FACTOR * gained > give_up_above)
+            )
+            active = active[~is_finished]
+        cov = invert_batch(curvature) * np.outer(self._scale, self._scale)
+        energies = np.where(np.isfinite(cov).all(axis=(1, 2)), self._free_energy(loss, curvature), np.inf)
+        return LaplaceFits(tuple(hypotheses), points, cov, sensor_stds, energies, loss)
+
+    def record_noise_scales(self, hypothesis: FitHypothesis, coefficients: FloatArray, sensor_std: float) -> FloatArray:
+        """(records,) the noises that each record shows at coefficients (K,), in parts of what they are on the whole."""
+        filter_inputs, n_observed = self._filter_inputs([hypothesis]), [np.isfinite(y).sum() for y in self.problem.y]
+        misfits = self._run_filter(coefficients[None], filter_inputs, np.array([sensor_std])).misfit
+        known_scales = (
+            np.ones(len(n_observed)) if self.problem.record_noise_scales is None else self.problem.record_noise_scales
+        )
+        excess = misfits / np.maximum(np.array(n_observed) - self.problem.model.n_states, 1)
+        found = known_scales * np.sqrt(excess)
+        return np.asarray(found / np.sqrt(np.average(found**2, weights=n_observed)))
+
+    def _filter_inputs(self, hypotheses: Sequence[FitHypothesis]) -> _FilterInputs:
+        rest = np.zeros((len(self.problem.u), 2))
+        input_paths = list(dict.fromkeys(h.input_path for h in hypotheses))
+        for input_path in input_paths:
+            if input_path not in self._samples:
+                self._samples[input_path] = self.problem.filter_samples(*input_path)
+        series = [self._samples[kind] for kind in input_paths]
+        longest = max(one.inputs.shape[1] for one in series)
+        rows = max(one.inputs.shape[2] for one in series)
+        has_spans = any(one.spans is not None for one in series)
+        ones = lambda one: np.ones(one.inputs.shape[:2]) if one.spans is None else one.spans  # noqa: E731
+        lengths = [_pad_series(ones(one), longest) for one in series] if has_spans else []
+        return _FilterInputs(
+            np.array([input_paths.index(h.input_path) for h in hypotheses]),
+            np.array([_pad_series(one.inputs, longest, rows) for one in series]),
+            np.array([_pad_series(one.outputs, longest, 1) for one in series]),
+            np.array(lengths) if lengths else None,
+            np.array([h.noise_ratio for h in hypotheses]),
+            np.array([rest if h.initial_states is None else h.initial_states for h in hypotheses]),
+        )
+
+    def _loss_and_derivatives(
+        self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
+        problem, count, records = self.problem, len(points), len(self.problem.u)
+        n = problem.n_observed_outputs - records * problem.model.n_states
+        found = self._run_filter(points, filter_inputs, sensor_stds)
+        total = lambda values: values.reshape(count, records, *values.shape[1:]).sum(axis=1)  # noqa: E731
+        with np.errstate(all="ignore"):
+            loss, gradient, information, misfit = (total(values) for values in found)
+            excess = misfit / n
+            data = 0.5 * (2 * loss - misfit + n * np.log(excess) + n)
+            deviation = points - self.prior.mean
+            prior_gradient = deviation @ self.prior.precision
+            total_loss = data + 0.5 * (deviation * prior_gradient).sum(axis=1)
+            gradient = self._scale * (gradient / excess[:, None] + prior_gradient)
+            curvature = self._in_prior_units(information / excess[:, None, None] + self.prior.precision)
+        bad = ~(np.isfinite(total_loss) & np.isfinite(gradient).all(axis=1) & np.isfinite(curvature).all(axis=(1, 2)))
+        bad |= (np.einsum("hii->hi", curvature) <= 0).any(axis=1)
+        total_loss = np.where(bad, np.inf, total_loss)
+        gradient[bad], curvature[bad] = 0.0, np.eye(len(self._scale))
+        return (
+            total_loss,
+            gradient,
+            curvature,
+            np.where(bad, sensor_stds, sensor_stds * np.sqrt(np.where(bad, 1.0, excess))),
+        )
+
+    def _run_filter(self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray) -> Followed:
+        """What the filter finds in all records at each of the points (H, K)."""
+        problem, records, inputs = (
+            self.problem,
+            len(self.problem.u),
+            filter_inputs.inputs[filter_inputs.input_path_index],
+        )
+        return follow(
+            problem.model,
+            np.repeat(points, records, axis=0),
+            inputs.reshape(-1, *inputs.shape[2:]),
+            filter_inputs.outputs[filter_inputs.input_path_index].reshape(-1, *filter_inputs.outputs.shape[2:]),
+            problem.noises_of_records(
+                np.stack([(filter_inputs.noise_ratios * sensor_stds) ** 2, sensor_stds**2], axis=1)
+            ),
+            problem.initial_state_cov,
+            filter_inputs.initial_states.reshape(-1, 2),
+            None
+            if filter_inputs.spans is None
+            else filter_inputs.spans[filter_inputs.input_path_index].reshape(-1, filter_inputs.spans.shape[2]),
+        )
+
+    def _free_energy(self, loss: FloatArray, curvature: FloatArray) -> FloatArray:
+        """(H,) free energies; inf where they are not finite."""
+        log_det = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(self._in_prior_units(self.prior.precision))[1]
+        return np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
+
+    def _in_prior_units(self, precision: FloatArray) -> FloatArray:
+        """A precision of the coefficients, of these in standard deviations of the prior."""
+        return precision * np.outer(self._scale, self._scale)
+
+
+def _with_unit_diagonal(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Matrices with 1 on their diagonals, and the roots of those that they had."""
+    root = np.sqrt(np.einsum("hii->hi", matrices))
+    return matrices / (root[:, :, None] * root[:, None, :]), root
+
+
+def solve_batch(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(H, K) solutions; zeros where a matrix is singular."""
+    unit, root = _with_unit_diagonal(matrices)
+    return _solve_each_if_singular(np.linalg.solve, 0.0, unit, (vectors / root)[:, :, None])[:, :, 0] / root
+
+
+def _solve_with_fixed_directions(matrices: FloatArray, vectors: FloatArray, directions: FloatArray) -> FloatArray:
+    """(H, K) solutions in the planes that are at right angles to the pins (H, K)."""
+    unit, root = _with_unit_diagonal(matrices)
+    plane = np.linalg.qr((directions / root)[:, :, None], mode="complete")[0][:, :, 1:]
+    transposed = np.swapaxes(plane, 1, 2)
+    return (
+        plane @ solve_batch(transposed @ unit @ plane, (transposed @ (vectors / root)[:, :, None])[:, :, 0])[:, :, None]
+    )[:, :, 0] / root
+
+
+def invert_batch(matrices: FloatArray) -> FloatArray:
+    """(H, K, K) inverses; NaN where a matrix is singular."""
+    unit, root = _with_unit_diagonal(matrices)
+    return _solve_each_if_singular(np.linalg.inv, np.nan, unit) / (root[:, :, None] * root[:, None, :])
+
+
+def _solve_each_if_singular(solve: Callable[..., FloatArray], fallback: float, *stacks: FloatArray) -> FloatArray:
+    """What ``solve`` makes of stacks: of all at once, or where a matrix is singular, of each; ``fallback`` for that one."""
+    try:
+        return np.asarray(solve(*stacks))
+    except np.linalg.LinAlgError:
+        if len(stacks[0]) == 1:
+            return np.full_like(stacks[-1], fallback)
+        rows = [[stack[i : i + 1] for stack in stacks] for i in range(len(stacks[0]))]
+        return np.concatenate([_solve_each_if_singular(solve, fallback, *row) for row in rows])
+
+
+def with_noise_ratios(hypothesis: FitHypothesis, ratios: FloatArray) -> list[FitHypothesis]:
+    """The same hypothesis at several ratios of the noises."""
+    return [replace(hypothesis, noise_ratio=float(ratio)) for ratio in ratios]

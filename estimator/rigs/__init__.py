@@ -1,0 +1,1 @@
+"""Rigs: units, channels, priors of a guess, the TOML files that ship."""

@@ -1,0 +1,351 @@
+"""The rig: how an oscillator stands in the world. Units, sampling step and scales are here, and nowhere else."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
+from estimator.models.model import Model
+from estimator.rigs.units import MAGNITUDE_BOUNDS, Scales, sensor_kind_of_unit
+from estimator.support.argument_checks import (
+    check_choice,
+    check_integer,
+    check_number,
+    did_you_mean,
+    mask_control_codes,
+    short_repr,
+)
+from estimator.support.file_io import check_readable_file, to_path, write_atomically
+
+#: How the input goes between samples, and the degree of the polynomial that each takes.
+INTERPOLATION_DEGREES = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
+
+#: Those of which the input may act a part of a sample later.
+FRACTIONAL_DELAY_INTERPOLATIONS = ("zero_order", "linear", "spline")
+
+#: More samples of delay are a record that was not aligned.
+MAX_DELAY = 1000
+
+#: No rig file is larger [bytes].
+_MAX_FILE_BYTES = 2**20
+
+#: Rigs that come with the package: name to file.
+SHIPPED_RIGS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"), key=lambda p: p.stem)}
+
+_GUESSED_PARAMETERS = ("m", "c", "a", "b")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The input or the output of a rig.
+
+    Attributes:
+        unit: such as ``"N"``, ``"V"``, ``"mm"`` or ``"m/s"``.
+        limit: of an input: never exceeded, in either direction. None: not known.
+        range: of an output: an experiment stops outside of it, in either direction. None: not known.
+        kind: what an output shows: ``displacement``, ``velocity`` or ``acceleration``.
+        noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
+            value of what stays unknown; None: nothing is known of it.
+        offset: first value of the offset, which stays unknown. `identify` takes outputs that lie far from 0 as they
+            are; a rig that is played has a range about 0.
+        lag: of an input: time constant [s] of a first-order lag between what is recorded and what acts, such as of a
+            voice coil. For `identify` alone. None: none.
+        column: its name in CSV files, with or without the unit behind it, or in MAT files. None stands for the usual
+            names (`estimator.identification.data.text_tables.read_table`).
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+    """
+
+    unit: str = "1"
+    limit: float | None = None
+    range: float | None = None
+    kind: str = "displacement"
+    noise: float | None = None
+    offset: float = 0.0
+    column: str | None = None
+    lag: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
+            raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
+        if mask_control_codes(self.unit) != self.unit or set(self.unit) & set(
+            ',;"[]'
+        ):  # it stands in heads of CSV files
+            raise ValueError(f"unit must hold no control codes, commas, quotes or brackets, but is {self.unit!r:.60}")
+        for name in ("limit", "range", "noise", "lag"):
+            value = getattr(self, name)
+            if value is not None:
+                of = {"limit": " of an input", "range": " of an output"}.get(name, "")
+                check_number(f"{name}{of}", value, *MAGNITUDE_BOUNDS, "leave it out where it is not known")
+        check_choice("kind", self.kind, DERIVATIVE_ORDER_OF_SENSOR)
+        check_number("offset", self.offset, -MAGNITUDE_BOUNDS[1], MAGNITUDE_BOUNDS[1], "0 where nothing is known")
+        if self.column is not None:
+            if not isinstance(self.column, str) or not 0 < len(self.column.strip()) <= 80:
+                raise ValueError(f"column must be a name in the records' files, but is {self.column!r:.60}")
+            if mask_control_codes(self.column) != self.column or set(self.column) & set(',;"'):
+                raise ValueError(f"column must hold no control codes, commas or quotes, but is {self.column!r:.60}")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Sampling step, input and output of an oscillator, and what is guessed of it. u and y are paired by index.
+
+    Attributes:
+        step: sampling step [s].
+        interpolation: of the input of a differential equation; a difference equation has taps instead. ``zero_order``:
+            u[k] acts from sample k to k + 1, and is first seen in y[k+1]: an accelerometer, too, shows y[k] just before
+            the input goes to u[k]. ``linear``: from u[k-1] to u[k]. Both are causal, and the input before the first was
+            0. ``look_ahead``: the quintic spline through the last nine inputs and the next one, so that a sample is
+            used when the next input is known. ``spline``: the quintic spline through all inputs, for recorded data that
+            is given at once. Before their first input it was the same.
+        delay: samples by which the input acts later than that. A difference equation's newest tap acts on y[k] with
+            u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those of
+            an environment: u[k] acted before y[k]. `identify` takes parts of a sample, from above -1 on.
+        input: its unit, limit, noise and offset.
+        output: its unit, kind, range, noise and offset.
+        guess: parameter m, c, a, b to the central 90 % interval of what is believed of it, in the units of the
+            channels; of any sign, but m is positive. None: nothing is known.
+
+    Raises:
+        ValueError: naming the argument, the value and the remedy.
+
+    Example:
+        >>> from estimator import Channel, Rig
+        >>> rig = Rig(step=1e-3, input=Channel("N", limit=20), output=Channel("m", range=0.03))
+        >>> rig.delay, rig.scales.unit((1, -3, 0))
+        (0, 'N/m³')
+    """
+
+    step: float
+    interpolation: str = "zero_order"
+    delay: float = 0
+    input: Channel = field(default_factory=Channel)
+    output: Channel = field(default_factory=Channel)
+    guess: Mapping[str, tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        check_number("step", self.step, *MAGNITUDE_BOUNDS, "give the seconds between samples")
+        check_choice("interpolation", self.interpolation, INTERPOLATION_DEGREES)
+        least = -1 if self.interpolation == "zero_order" else 0
+        if isinstance(self.delay, float) and not self.delay.is_integer():
+            check_number(f"delay (for {self.interpolation})", self.delay, -0.999, MAX_DELAY)
+            check_choice(
+                "interpolation (for a delay in parts of a sample)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS
+            )
+        else:
+            check_integer(f"delay (for {self.interpolation})", self.delay, MAX_DELAY, least)
+        for name, other in (("input", "range"), ("output", "limit")):
+            channel = getattr(self, name)
+            right = "limit" if other == "range" else "range"
+            given = channel.get(other) if isinstance(channel, Mapping) else getattr(channel, other, None)
+            if given is not None:
+                raise ValueError(f"{name} must have no {other}, but has {short_repr(given)}; use {right}")
+            if isinstance(channel, Mapping):
+                channel = _from_mapping(Channel, channel, name)
+                object.__setattr__(self, name, channel)
+            if not isinstance(channel, Channel):
+                raise ValueError(f"{name} must be a Channel, but is {channel!r:.60}; use Channel('N', limit=20)")
+        if self.output.lag is not None:
+            raise ValueError(f"output must have no lag, but has {self.output.lag}; a lag is of the input")
+        if self.input.lag is not None:
+            check_choice(
+                "interpolation (for an input with a lag)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS[:2]
+            )
+        if self.input.kind != "displacement":
+            raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
+        if (told := sensor_kind_of_unit(self.output.unit)) not in (None, self.output.kind):
+            raise ValueError(
+                f"output.kind must be {told!r} with the unit {self.output.unit}, but is {self.output.kind!r}; mend one"
+            )
+        object.__setattr__(self, "guess", _check_guess(self.guess))
+
+    @classmethod
+    def silverbox(cls, interpolation: str = "spline", delay: int = 0) -> Rig:
+        """The Silverbox record's, which ships: its input is band-limited. Online take ``linear`` or ``look_ahead``."""
+        return replace(cls.shipped("silverbox"), interpolation=interpolation, delay=delay)
+
+    @classmethod
+    def shipped(cls, name: str) -> Rig:
+        """A rig that comes with the package.
+
+        Raises:
+            ValueError: for another name.
+
+        Example:
+            >>> from estimator import Rig
+            >>> Rig.shipped("beam").output.unit
+            'mm'
+        """
+        check_choice("name", name, SHIPPED_RIGS)
+        return _read_shipped(name)
+
+    @classmethod
+    def from_dict(cls, mapping: Mapping[str, Any]) -> Rig:
+        """From nested dictionaries, as `to_dict` gives them, or a rig file holds them.
+
+        Raises:
+            ValueError: naming the key, for one that is unknown or missing, or a value out of its range.
+        """
+        return _from_mapping(cls, mapping, "rig")
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Rig:
+        """Read a rig file, TOML: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
+
+        A table ``instrument`` is for who drives the rig (`read_with_instrument`).
+
+        Raises:
+            ValueError: naming the file and what is wrong in it.
+            FileNotFoundError: if there is no such file.
+        """
+        return cls._read(path)[0]
+
+    @classmethod
+    def read_with_instrument(cls, rig: str) -> tuple[Rig, dict[str, Any]]:
+        """A rig, as `of` has it, and the table ``instrument`` of its file; of a rig that ships, and of none, empty.
+
+        Raises:
+            ValueError: as `from_file`, or for an ``instrument`` that is no table.
+            FileNotFoundError: if there is no such file.
+        """
+        return (cls.shipped(rig), {}) if rig in SHIPPED_RIGS else cls._read(rig)
+
+    @classmethod
+    def _read(cls, path: str | Path) -> tuple[Rig, dict[str, Any]]:
+        must = f"rig must be a file, a short TOML, or one of {', '.join(SHIPPED_RIGS)}"
+        place = check_readable_file(path, must, _MAX_FILE_BYTES, "write it by hand, or by duffing-env rig init")
+        text = ""
+        try:
+            text = place.read_text(encoding="utf-8-sig")
+            mapping = tomllib.loads(text)
+            instrument = mapping.pop("instrument", {})
+            if not isinstance(instrument, dict):
+                raise ValueError(f"instrument must be a table, but is {short_repr(instrument)}; write [instrument]")
+            return cls.from_dict(mapping), instrument
+        except (ValueError, RecursionError) as error:
+            comma = " (a number has a point: 0.5, not 0,5)" if re.search(r"=\s*[-+]?\d+,\d", text) else ""
+            raise ValueError(f"{place} must be a rig file, but is not: {error}{comma}") from error
+
+    @classmethod
+    def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
+        """A rig from whatever describes one: itself, a dictionary, the name of its file, or that of one that ships.
+
+        Where a file has the name of a rig that ships, write ``./beam``.
+        """
+        if isinstance(rig, Rig):
+            return rig
+        if isinstance(rig, Mapping):
+            return cls.from_dict(rig)
+        if isinstance(rig, str | Path):
+            return cls.shipped(rig) if isinstance(rig, str) and rig in SHIPPED_RIGS else cls.from_file(rig)
+        raise ValueError(f"rig must be a Rig, a dictionary or a file name, but is {rig!r:.60}; use Rig(step=...)")
+
+    def save(self, path: str | Path) -> None:
+        """Write a rig file, with comments, from which `from_file` gives the same rig; what was there is replaced.
+
+        Raises:
+            ValueError: for what is not the name of a file.
+            OSError: where it cannot be written; what was there before still is.
+
+        Example:
+            >>> from estimator import Rig
+            >>> rig = Rig(step=1e-3, guess={"m": (0.3, 0.5), "c": (0, 2), "a": (1e3, 5e3), "b": (0, 1e8)})
+            >>> rig.save("rig.toml")
+            >>> Rig.from_file("rig.toml") == rig
+            True
+        """
+        from estimator.rigs.rig_toml import to_toml
+
+        write_atomically(to_path("path", path), to_toml(self))
+
+    def to_dict(self) -> dict[str, Any]:
+        """What JSON and TOML can hold, without what was left out."""
+        mapping: dict[str, Any] = asdict(self)
+        mapping["guess"] = None if self.guess is None else {name: list(ends) for name, ends in self.guess.items()}
+        for name in ("input", "output"):
+            mapping[name] = {key: value for key, value in mapping[name].items() if value is not None}
+        return {key: value for key, value in mapping.items() if value is not None}
+
+    @property
+    def integer_delay(self) -> int:
+        """The delay, for those that follow the input sample by sample.
+
+        Raises:
+            ValueError: for a delay in parts of a sample, or a lag of the input, which `identify` alone follows.
+        """
+        if self.input.lag is not None:
+            raise ValueError(f"input must have no lag but for identify, but has {self.input.lag} s; leave it out")
+        if self.delay != int(self.delay):
+            raise ValueError(f"delay must be whole samples but for identify, but is {self.delay}; round it")
+        return int(self.delay)
+
+    @property
+    def scales(self) -> Scales:
+        """The input's limit and the output's range, 1 where they are not known, with step and units."""
+        order = DERIVATIVE_ORDER_OF_SENSOR[self.output.kind]
+        units = self.input.unit, self.output.unit
+        return Scales(float(self.step), self.input.limit or 1.0, self.output.range or 1.0, order, *units)
+
+    @property
+    def model(self) -> Model:
+        """Eq. (1) with offsets, as the rig's sensor shows it."""
+        return duffing(offsets=True, sensor=self.output.kind)
+
+
+@cache
+def _read_shipped(name: str) -> Rig:
+    return Rig.from_file(SHIPPED_RIGS[name])
+
+
+def _check_guess(guess: object) -> dict[str, tuple[float, float]] | None:
+    """Checked intervals; None where nothing is guessed."""
+    if guess is None:
+        return None
+    if not isinstance(guess, Mapping) or set(guess) != set(_GUESSED_PARAMETERS):
+        named = list(guess) if isinstance(guess, Mapping) else guess
+        raise ValueError(
+            f"guess must have intervals of {list(_GUESSED_PARAMETERS)}, but is of {named!r:.80}; or leave it out"
+        )
+    checked = {}
+    for name in _GUESSED_PARAMETERS:
+        given = guess[name]
+        ends = list(given) if isinstance(given, list | tuple | np.ndarray) else [given]
+        if len(ends) != 2:
+            raise ValueError(f"guess of {name} must be two numbers, low < high, but is {short_repr(given)}")
+        least = MAGNITUDE_BOUNDS[0] if name == "m" else -MAGNITUDE_BOUNDS[1]
+        for end in ends:
+            check_number(
+                f"guess of {name}", end, least, MAGNITUDE_BOUNDS[1], "a mass is above 0" if name == "m" else ""
+            )
+        if not ends[0] < ends[1]:
+            raise ValueError(f"guess of {name} must be two numbers, low < high, but is {short_repr(given)}")
+        checked[name] = (float(ends[0]), float(ends[1]))
+    return checked
+
+
+def _from_mapping(cls: Any, mapping: object, label: str) -> Any:
+    """An object of a dataclass, from a dictionary of its arguments."""
+    if not isinstance(mapping, Mapping):
+        raise ValueError(f"{label} must be a table of names and values, but is {mapping!r:.60}")
+    known = [one.name for one in fields(cls)]
+    for key in mapping:
+        if key not in known:
+            raise ValueError(f"{label} must have keys of {known}, but has {key!r:.60}{did_you_mean(key, known)}")
+    if cls is Rig and "step" not in mapping:
+        raise ValueError("rig must have a step, but has none; give the seconds between samples")
+    if cls is Rig:
+        return cls(**mapping)
+    try:
+        return cls(**mapping)
+    except ValueError as error:  # which begins with the name of a key
+        key, _, rest = str(error).partition(" ")
+        raise ValueError(f"{label}.{key} {rest.removeprefix(f'of an {label} ')}") from error

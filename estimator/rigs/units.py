@@ -1,0 +1,189 @@
+"""Units and scales: between the world of a rig and the numbers near one that compiled code works with.
+
+Inside, time is counted in samples, the input in parts of its scale U, and the displacement in parts of X. A sensor of
+displacement, velocity or acceleration (``order`` 0, 1, 2) has the scale S = X / step**order: its number inside is per
+sample, or per sample squared.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from estimator.support.argument_checks import check_number
+from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+
+#: Powers of the input's unit, the displacement's unit and the second.
+UnitPowers = tuple[int, int, int]
+
+#: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
+MAGNITUDE_BOUNDS = 1e-30, 1e30
+
+#: Units of SI, which prefixes scale; and others, with what each is in SI.
+_SI_UNITS, _SI_PREFIXES = (
+    "N|V|A|Pa|m",
+    {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "": 1.0, "k": 1e3, "M": 1e6},
+)
+_OTHER_UNITS = {"in": (0.0254, "m"), "ft": (0.3048, "m"), "deg": (math.pi / 180, "rad"), "°": (math.pi / 180, "rad")}
+_UNITS_WITHOUT_PREFIX = {"g": (9.80665, "m/s²"), "lb": (4.4482216152605, "N"), "lbf": (4.4482216152605, "N")}
+_UNITS_WITHOUT_PREFIX |= {"mps": (1.0, "m/s"), "mps2": (1.0, "m/s²")}
+_COMPOUND_SUFFIXES = {"": "", "/s": "/s", "/s2": "/s²", "/s/s": "/s²", "m": " m", "/V": "/V"}
+
+#: Units that only one kind of output has.
+_UNIT_PATTERN_OF_KIND = {
+    "displacement": r"[mµμun]?m|cm|in",
+    "velocity": r"[^/]+/s",
+    "acceleration": r".+/s(²|\^?2|/s)|m?g",
+}
+
+SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_DIGITS_OF_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_UNIT_FACTOR = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))?")
+
+
+def sensor_kind_of_unit(unit: str) -> str | None:
+    """The kind of output that alone has a unit; None for one that tells none, such as V."""
+    return next((kind for kind, units in _UNIT_PATTERN_OF_KIND.items() if re.fullmatch(units, unit)), None)
+
+
+def normalise_unit(unit: str) -> str:
+    """A unit in one way of writing."""
+    for written, usual in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
+        unit = unit.replace(written, usual)
+    return unit.replace(" ", "")
+
+
+def to_si_unit(unit: str) -> tuple[float, str]:
+    """A unit as a factor and the unit of SI that it is a part or a multiple of; 1 and itself where it is none such.
+
+    Example:
+        >>> [to_si_unit(unit) for unit in ("mm", "µm/s", "N", "m/s^2", "counts")]
+        [(0.001, 'm'), (1e-06, 'm/s'), (1.0, 'N'), (1.0, 'm/s²'), (1.0, 'counts')]
+    """
+    bare = normalise_unit(unit)
+    if bare in _UNITS_WITHOUT_PREFIX:
+        return _UNITS_WITHOUT_PREFIX[bare]
+    found = re.fullmatch(rf"(?:([{''.join(_SI_PREFIXES)}]?)({_SI_UNITS})|({'|'.join(_OTHER_UNITS)}))(.*)", bare)
+    if found is None or found[4] not in _COMPOUND_SUFFIXES:
+        return 1.0, unit
+    factor, base = _OTHER_UNITS[found[3]] if found[3] else (_SI_PREFIXES[found[1]], found[2])
+    return factor, base + _COMPOUND_SUFFIXES[found[4]]
+
+
+def conversion_factor(source: str, target: str) -> float | None:
+    """By what numbers in one unit are multiplied to be in another; None where these are of different quantities.
+
+    Example:
+        >>> conversion_factor("mm", "m"), conversion_factor("in", "in"), conversion_factor("m", "mm"), conversion_factor("mm", "V")
+        (0.001, 1.0, 1000.0, None)
+    """
+    (factor, base), (other, own) = to_si_unit(source), to_si_unit(target)
+    return factor / other if normalise_unit(base) == normalise_unit(own) else None
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What one inside is worth outside.
+
+    Attributes:
+        step: sampling step [s].
+        input: scale U of the input, in its unit.
+        output: scale S of the sensor, in its unit.
+        order: time derivative of the displacement that the sensor shows: 0, 1 or 2.
+        input_unit: such as ``"N"``.
+        output_unit: such as ``"m"``, or ``"m/s"`` for a velocity.
+
+    Example:
+        >>> from estimator.rigs.units import Scales
+        >>> scales = Scales(step=1e-3, input=20.0, output=0.03, input_unit="N", output_unit="m")
+        >>> scales.unit((1, -1, 2)), scales.unit((1, -3, 0)), scales.unit((1, -1, 1))
+        ('kg', 'N/m³', 'N s/m')
+    """
+
+    step: float = SILVERBOX_SAMPLING_STEP
+    input: float = 1.0
+    output: float = 1.0
+    order: int = 0
+    input_unit: str = "V"
+    output_unit: str = "V"
+
+    def __post_init__(self) -> None:
+        check_number("step", self.step, *MAGNITUDE_BOUNDS, "give the seconds between samples")
+        for name in ("input", "output"):
+            check_number(name, getattr(self, name), *MAGNITUDE_BOUNDS)
+
+    @property
+    def displacement(self) -> float:
+        """Scale X of the displacement."""
+        return float(self.output * self.step**self.order)
+
+    def factor(self, dimension: UnitPowers) -> float:
+        """What one inside is worth, of a quantity whose time is in seconds already."""
+        return float(self.input ** dimension[0] * self.displacement ** dimension[1])
+
+    def unit(self, dimension: UnitPowers) -> str:
+        """Of a quantity, in the units of the rig's channels; ``"1"`` for a pure number."""
+        powers: dict[str, int] = {}
+        displacement = _parse_unit(self.output_unit)
+        displacement["s"] = displacement.get("s", 0) + self.order
+        parts = ((_parse_unit(self.input_unit), dimension[0]), (displacement, dimension[1]), ({"s": 1}, dimension[2]))
+        for atoms, power in parts:
+            for atom, exponent in atoms.items():
+                powers[atom] = powers.get(atom, 0) + exponent * power
+        return format_unit({atom: power for atom, power in powers.items() if power})
+
+
+#: The Silverbox's: input and output in volts, as they are.
+VOLT_SCALES = Scales()
+
+
+def _parse_unit(unit: str) -> dict[str, int]:
+    """Atoms of a unit such as ``m/s²``, with their powers."""
+    powers: dict[str, int] = {}
+    for k, part in enumerate(unit.translate(_DIGITS_OF_SUPERSCRIPTS).split("/")):
+        for atom, power in _UNIT_FACTOR.findall(part):
+            powers[atom] = powers.get(atom, 0) + (-1 if k else 1) * int(power or 1)
+    return powers
+
+
+def format_unit(powers: Mapping[str, int]) -> str:
+    """A unit from the powers of its atoms."""
+    if dict(powers) == {"N": 1, "m": -1, "s": 2}:
+        return "kg"
+    numerator = [atom + _format_power(power) for atom, power in powers.items() if power > 0]
+    denominator = {atom: -power for atom, power in powers.items() if power < 0}
+    if numerator and len(denominator) == 1:
+        ((atom, power),) = denominator.items()
+        return f"{' '.join(numerator)}/{atom}{_format_power(power)}"
+    return " ".join([*numerator, *(f"{atom}{_format_power(-power)}" for atom, power in denominator.items())]) or "1"
+
+
+def axis_label(name: str, unit: str) -> str:
+    """What an axis or a column is called.
+
+    Example:
+        >>> axis_label("u", "V"), axis_label("u", "m/s"), axis_label("u", "1")
+        ('u / V', 'u / (m/s)', 'u')
+    """
+    if unit == "1":
+        return name
+    return f"{name} / {unit}" if unit.isalpha() else f"{name} / ({unit})"
+
+
+def _format_power(power: int) -> str:
+    return "" if power == 1 else str(power).translate(SUPERSCRIPTS)
+
+
+def digits_to_distinguish(low: float, high: float, minimum: int) -> int:
+    """Significant digits, a ``minimum`` number or more, that show that the ends of an interval differ.
+
+    Example:
+        >>> digits_to_distinguish(0.0023, 0.0023000001, 5), digits_to_distinguish(1.0, 2.0, 5)
+        (9, 5)
+    """
+    for digits in range(minimum, 16):
+        if f"{low:.{digits}g}" != f"{high:.{digits}g}":
+            return digits if digits == minimum else digits + 1
+    return minimum
