@@ -16,9 +16,9 @@ from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout, noise_std_rows
 from duffing_env.storage.random_streams import new_stream_words
-from estimator.engine.tasks import structured
+from estimator.compilation.simd import LANES, kernel
+from estimator.engine.kernels import compile_belief_update
 from estimator.inference import mean_field
-from estimator.lanes import LANES, kernel
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
@@ -44,7 +44,7 @@ def plant_mover() -> Any:
         _PLACE["U_0"] * LANES,
     )
 
-    @kernel(kind=_EXPERIMENT.kernel_spec.name)
+    @kernel(variant=_EXPERIMENT.kernel_spec.name)
     def move_all(blocks, inputs):
         for b in range(len(blocks)):
             W = blocks[b]
@@ -61,14 +61,14 @@ def updater(factorisation: str, iterations: int) -> Any:
     """``infer_all(blocks, inputs, outputs)``, one sample for the beliefs of all blocks, and the rows of a block."""
     is_structured, model = factorisation == "structured", _EXPERIMENT.model
     if is_structured:
-        task = structured(model, iterations=iterations)
+        task = compile_belief_update(model, iterations=iterations)
         update, place = task.update, task.layout
     else:
-        place = mean_field.layout()
-        update = mean_field.updater(place)
+        place = mean_field.mean_field_layout()
+        update = mean_field.compile_mean_field_loop(place)
     u, y = place["U_0"] * LANES, place["Y_y"] * LANES
 
-    @kernel(kind=f"{model.digest}_{factorisation}_{iterations}")
+    @kernel(variant=f"{model.digest}_{factorisation}_{iterations}")
     def infer_all(blocks, inputs, outputs):
         for b in range(len(blocks)):
             W = blocks[b]

@@ -17,8 +17,8 @@ from benchmarks.component_timing import SAMPLES, EstimatorOnly, plant_only, play
 from benchmarks.peer_process import Peers
 from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import Row, later, measure, timed
+from estimator.compilation.simd import LANES
 from estimator.inference import DEFAULT_ITERATIONS
-from estimator.lanes import LANES
 
 TRACK, CONTINUOUS = "duffing_env/Amplitude-v0", "duffing_env/Amplitude-v1"
 UNIT = "env-steps/s"

@@ -1,9 +1,9 @@
 """Section 4a: how near the compiled step comes to what this processor can do, and what keeps it from getting nearer.
 
-The yardsticks are compiled the same way as the step (`estimator.lanes.lanewise`): multiply-adds, divisions, square
+The yardsticks are compiled the same way as the step (`estimator.compilation.simd.lanewise`): multiply-adds, divisions, square
 roots and copies on independent values that stay in the nearest cache. Everything here runs on one thread.
 
-Operations are counted in what `estimator.straight` gives to LLVM, where each stands once for every lane. The compiler
+Operations are counted in what `estimator.compilation.scalar_jit` gives to LLVM, where each stands once for every lane. The compiler
 still finds an expression or two that are written twice; divisions and roots are as many in the assembly.
 """
 
@@ -23,9 +23,9 @@ from duffing_env.kernel import RESET_NEXT_STEP, compile_belief_update
 from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout
+from estimator.compilation.scalar_jit import scalar_jit
+from estimator.compilation.simd import LANES, jit, lanewise, number_rows
 from estimator.inference import mean_field
-from estimator.lanes import LANES, jit, lanewise, rows
-from estimator.straight import straight
 
 SIZE = 1024
 STEPS = 256
@@ -43,14 +43,14 @@ _PIECES = {
 }
 _STEPS = {"structured": "whole step, structured", "mean_field": "whole step, mean field"}
 
-_YARDSTICK = rows("a b c d")
+_YARDSTICK = number_rows("a b c d")
 _FUSED = "multiply-adds, one thread"
 _DIVISIONS = "divisions, one thread"
 _ROOTS = "square roots, one thread"
 _STORES = "loads and stores, nearest cache, one thread"
 
 
-@straight
+@scalar_jit
 def _four(value, x, y):
     value = value * x + y
     value = value * x + y
@@ -58,7 +58,7 @@ def _four(value, x, y):
     return value * x + y
 
 
-@straight
+@scalar_jit
 def _sixteen(value, x, y):
     return _four(_four(_four(_four(value, x, y), x, y), x, y), x, y)
 
@@ -116,7 +116,7 @@ def count(functions: dict[Any, int]) -> Counter[str]:
     counted: Counter[str] = Counter()
     for function, times in functions.items():
         kinds = tuple("ptr" if name in _BLOCKS else "double" for name in function.source.arguments)
-        text = "".join(function.translated(kinds).definitions.values())
+        text = "".join(function.translate(kinds).definitions.values())
         for instruction, names in _INSTRUCTIONS.items():
             for name in names:
                 counted[name] += times * len(re.findall(instruction, text))
@@ -131,7 +131,7 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     if factorisation == "structured":
         inference = {compile_belief_update(kind): 1}
     else:
-        begin, iterate, end, _ = mean_field.pieces(block_layout(kind))
+        begin, iterate, end, _ = mean_field.compile_mean_field(block_layout(kind))
         inference = {begin: 1, iterate: experiment.kernel_params.iterations, end: 1}
     return {
         "noise": {compile_noise_draw(block_layout(kind)): 1},

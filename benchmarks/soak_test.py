@@ -26,7 +26,7 @@ from agents.cli import iterate_with_progress, run_script
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.tracks.track_registry import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
-from estimator.belief import check_record, covariance_places
+from estimator.belief import check_belief_record, covariance_indices
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 
@@ -144,7 +144,7 @@ def filtered(name: str, steps: int) -> dict[str, int]:
 
 def _unsound(model: Any, records: Any) -> int:
     """How many records (n, size) are no belief: all are looked at together, and one by one what is not plainly one."""
-    covs = records[:, covariance_places(model)]
+    covs = records[:, covariance_indices(model)]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
         correlations = covs / stds[:, :, None] / stds[:, None]
@@ -157,7 +157,7 @@ def _unsound(model: Any, records: Any) -> int:
 def _is_sound(model: Any, record: Any) -> bool:
     """Whether a record is a belief."""
     try:
-        check_record("belief", model, record, 1e-5)
+        check_belief_record("belief", model, record, 1e-5)
     except ValueError:
         return False
     return True

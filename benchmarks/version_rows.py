@@ -51,9 +51,9 @@ def update_of(equation: str) -> tuple[Any, list[int], int, int]:
     continuous = equation == "Eq. (1)"
     if HAS_ENGINE:
         from estimator import difference, duffing
-        from estimator.engine.tasks import structured
+        from estimator.engine.kernels import compile_belief_update
 
-        task = structured(duffing() if continuous else difference(), int(continuous))
+        task = compile_belief_update(duffing() if continuous else difference(), int(continuous))
         inputs = [task.layout[name] for name in ("U_0", "U_1")[: 1 + continuous]]
         return task.update, inputs, task.layout["Y_y"], len(task.layout)
 
@@ -78,7 +78,7 @@ def update_of(equation: str) -> tuple[Any, list[int], int, int]:
 
 def inference(equation: str) -> Action:
     """Structured inference alone, of SIZE systems; every SAMPLES samples it begins again at the track's prior."""
-    from estimator.lanes import LANES
+    from estimator.compilation.simd import LANES
 
     env = gym.make(TRACKS[equation], **(KNOWN if equation == "Eq. (1)" else {})).unwrapped
     env.reset(seed=0)

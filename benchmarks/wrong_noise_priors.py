@@ -16,7 +16,7 @@ from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy
 from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
 from benchmarks.rigs.calibration import judge_coverage
-from estimator.ensemble import Hypotheses
+from estimator.inference.noise_grid import NoiseGridSize
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
@@ -133,7 +133,7 @@ def main(config: Config) -> None:
     from rich.progress import track as shown
 
     numbers = config.hypotheses
-    hypotheses: Hypotheses = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+    hypotheses: NoiseGridSize = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
     centers = [pair for pair in product(config.factors, config.factors) if pair != (1.0, 1.0)]
     results = {}
     for track in config.tracks:

@@ -25,7 +25,7 @@ from duffing_env.storage.kernel_spec import (
 )
 from duffing_env.storage.random_streams import new_stream_words
 from estimator.belief import Belief, record_size
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 from estimator.support.array_types import FloatArray, Parameters
 
 _OUTCOME_NAMES = tuple(name.lower() for name in OUTCOME_ROWS)

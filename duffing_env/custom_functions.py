@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.storage.kernel_spec import observation_bounds
-from estimator.belief import covariance_places
+from estimator.belief import covariance_indices
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.units import VOLT_SCALES, Scales
@@ -60,7 +60,7 @@ class Beliefs:
     @property
     def cov(self) -> FloatArray:
         """(n, d, d) their covariances."""
-        return self.records[:, covariance_places(self.model)]
+        return self.records[:, covariance_indices(self.model)]
 
     @property
     def coefficients_mean(self) -> FloatArray:
@@ -71,7 +71,7 @@ class Beliefs:
     def coefficients_cov(self) -> FloatArray:
         """(n, K, K) covariances of the coefficients."""
         n = self.model.n_states
-        return self.records[:, covariance_places(self.model)[n:, n:]]
+        return self.records[:, covariance_indices(self.model)[n:, n:]]
 
     @property
     def noises(self) -> FloatArray:

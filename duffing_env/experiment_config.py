@@ -18,13 +18,13 @@ from duffing_env.rewards.reward_registry import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
 from estimator.belief import Belief
-from estimator.ensemble import Hypotheses, first_weights, priors, start
-from estimator.inference import DEFAULT_ITERATIONS, MOST_ITERATIONS
+from estimator.inference import DEFAULT_ITERATIONS, MAX_ITERATIONS
+from estimator.inference.noise_grid import NoiseGridSize, initial_weights, member_priors, mixture_record
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.priors import log_uniform_moments, weak_prior
 from estimator.rigs.units import Scales
-from estimator.settings import checked_hypotheses
+from estimator.settings import checked_noise_hypotheses
 from estimator.support.argument_checks import (
     MAX_MAGNITUDE,
     MIN_MAGNITUDE,
@@ -60,7 +60,7 @@ class Experiment:
     hold: int = 1
     terminal: bool = False
     terminated_return: float | None = None
-    noise_hypotheses: Hypotheses = 1
+    noise_hypotheses: NoiseGridSize = 1
     branch: str = "train"
 
     #: Whether there is a true plant to compare with.
@@ -72,7 +72,7 @@ class Experiment:
         check_choice("branch", self.branch, SEED_BRANCHES)
         check_choice("factorisation", self.factorisation, DEFAULT_ITERATIONS)
         if self.iterations is not None:
-            check_integer("iterations", self.iterations, MOST_ITERATIONS)
+            check_integer("iterations", self.iterations, MAX_ITERATIONS)
         check_reward(self.reward)
         if callable(self.reward) and (self.terminal or self.terminated_return is not None):
             raise ValueError("terminal and terminated_return must be left out with a reward of one's own")
@@ -85,7 +85,7 @@ class Experiment:
             check_number(
                 "terminated_return", self.terminated_return, -MAX_MAGNITUDE, MAX_MAGNITUDE, "None keeps what was gained"
             )
-        hypotheses = checked_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MAX_HYPOTHESES)
+        hypotheses = checked_noise_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MAX_HYPOTHESES)
         object.__setattr__(self, "noise_hypotheses", hypotheses)
 
     @property
@@ -146,7 +146,7 @@ class Experiment:
 
     @property
     def likeliest_log_noise_ratio(self) -> float | None:
-        """Where hypotheses about the noises are likeliest at first (`estimator.ensemble.first_weights`)."""
+        """Where hypotheses about the noises are likeliest at first (`estimator.inference.noise_grid.initial_weights`)."""
         return None
 
     @property
@@ -169,9 +169,9 @@ class Experiment:
         prior, model, names = self.prior_belief, self.model, parameter_names(self.truth_model)
         first_record, plant_fields = prior.record, dict(self.plant_params)
         if self.noise_hypotheses != 1:
-            members = priors(prior, self.noise_hypotheses)
-            weights = first_weights(members, self.likeliest_log_noise_ratio)
-            first_record = start(members, len(model.names), weights)
+            members = member_priors(prior, self.noise_hypotheses)
+            weights = initial_weights(members, self.likeliest_log_noise_ratio)
+            first_record = mixture_record(members, len(model.names), weights)
             plant_fields["hypothesis_priors"] = np.column_stack([members[:, -4:], weights])
         precisions = first_record[-2 - 2 * model.n_outputs :]
         values: dict[str, Any] = {
@@ -258,13 +258,13 @@ class SimulatedExperiment(Experiment):
     def prior_belief(self) -> Belief:
         """The prior of one's own, or the one that fits plants so drawn, and the noises."""
         if self.prior is not None:
-            return self.prior.factorised(self.factorisation)
+            return self.prior.with_factorisation(self.factorisation)
         return self.prior_for_model(self.model, self.factorisation)
 
     def prior_for_model(self, model: Model, factorisation: str = "structured") -> Belief:
         """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
         noises = *self.prior_noise_stds, self.noise_shape
-        return weak_prior(model, *self.coefficient_moments(model), *noises, scales=self.scales).factorised(
+        return weak_prior(model, *self.coefficient_moments(model), *noises, scales=self.scales).with_factorisation(
             factorisation
         )
 

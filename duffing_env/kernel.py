@@ -27,10 +27,10 @@ from duffing_env.storage.kernel_spec import (
     observation_bounds,
     parameter_names,
 )
-from estimator.engine.rows import belief_names
-from estimator.engine.tasks import structured
+from estimator.compilation.simd import LANES, jit_closure, kernel, lanewise
+from estimator.engine.kernels import compile_belief_update
+from estimator.engine.storage_layout import belief_rows
 from estimator.inference import mean_field
-from estimator.lanes import LANES, kernel, lanewise, part
 
 #: How finished environments are reset: by hand, in the step after, or in the same step; or what is done is a reset.
 RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP, RESET_ONLY = 0, 1, 2, 3
@@ -66,7 +66,7 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
     row_of, generated = block_layout(spec), env_codegen.generated_functions(spec)
     n_rows = max(row_of.values()) + 1
     offset_of = {name: number * LANES for name, number in row_of.items()}
-    n_record = len(belief_names(spec.belief_model))
+    n_record = len(belief_rows(spec.belief_model))
     n_observation, n_outcome = len(observation_bounds(spec.belief_model)), len(OUTCOME_ROWS)
     n_saved = n_record * LANES
     first_stream, first_parameter = offset_of["STREAM_a"], offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
@@ -92,13 +92,13 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
         plant_stages.pay_reward
     )
     streams = "STREAM_a STREAM_b STREAM_c STREAM_d"
-    draw_parameter_jump = lanewise(row_of, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon", one=True)(
+    draw_parameter_jump = lanewise(row_of, f"{streams} JUMP_AT JUMP_FACTOR", uniform="jump horizon", single_lane=True)(
         plant_stages.draw_parameter_jump
     )
 
     is_simulated = spec.plant_model is not None
     step_plant: Any = _compile_plant_step(spec, generated, draw_noise) if is_simulated else None
-    update_belief = compile_belief_update(spec)
+    update_belief = compile_update_stage(spec)
     has_noise_hypotheses = spec.has_noise_hypotheses
     reset_filter_bank, update_filter_bank = compile_filter_bank(spec) if has_noise_hypotheses else NO_FILTER_BANK
     has_reward_hooks, is_structured = bool(spec.reward_hooks), spec.factorisation == "structured"
@@ -114,7 +114,7 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
     )
     add_random_walk: Any = generated.walk
     unpack = compile_unpacker(spec)
-    compile_inner, compile_entry = part(spec.name), kernel(kind=spec.name)
+    compile_inner, compile_entry = jit_closure(spec.name), kernel(variant=spec.name)
 
     @compile_inner
     def compare_to_truth(W, j, params):
@@ -272,16 +272,18 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
     return Kernel(step, step_parallel)
 
 
-def compile_belief_update(spec: KernelSpec) -> Any:
+def compile_update_stage(spec: KernelSpec) -> Any:
     """Update every lane's belief, with its input and outputs in their rows.
 
     ``update(W)``, or of mean field ``update(W, iterations, as_published)``.
     """
     row_of = block_layout(spec)
     if spec.factorisation == "mean_field":
-        return mean_field.updater(row_of)
+        return mean_field.compile_mean_field_loop(row_of)
     trace = spec.reward_hooks == "free_energy"
-    return structured(spec.belief_model, spec.degree, iterations=spec.iterations, within=row_of, trace=trace).update
+    return compile_belief_update(
+        spec.belief_model, spec.degree, iterations=spec.iterations, block_layout=row_of, keep_trace=trace
+    ).update
 
 
 def _compile_plant_step(spec: KernelSpec, generated: Any, draw_noise: Any) -> Any:
@@ -297,7 +299,7 @@ def _compile_plant_step(spec: KernelSpec, generated: Any, draw_noise: Any) -> An
     sense_2 = getattr(generated, "sense_2", sense_0)
     is_continuous = model.is_continuous
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def step_plant(W):
         if is_continuous:
             for s in range(steps):

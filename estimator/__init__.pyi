@@ -1,13 +1,13 @@
 # The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
 from .belief import Belief
-from .ensemble import NoiseRatio
 from .identification import identify
 from .identification.identification_result import Result
-from .information import cramer_rao, fisher_information, relative_covariance
+from .inference.fisher_information import cramer_rao, fisher_information, relative_covariance
+from .inference.noise_grid import NoiseRatio
+from .inference.pem_narx import PEMNARX
 from .models.difference_equation import difference
 from .models.duffing import duffing
 from .models.model import Model
-from .offline import PEMNARX
 from .online import OnlineEstimator
 from .priors import paper_text_prior, published_run_prior, recorded_prior, silverbox_prior, weak_prior
 from .rigs.physical_parameters import coefficients_of, to_physical

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.rows import belief_names
+from estimator.engine.storage_layout import belief_rows
 from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import propagate_to_physical
@@ -20,7 +20,7 @@ from estimator.support.array_types import FloatArray
 
 
 @cache
-def covariance_places(model: Model) -> npt.NDArray[np.intp]:
+def covariance_indices(model: Model) -> npt.NDArray[np.intp]:
     """(d, d) places of the covariance's entries in a record, for d states and coefficients."""
     d = len(model.names)
     places = np.empty((d, d), dtype=np.intp)
@@ -32,17 +32,17 @@ def covariance_places(model: Model) -> npt.NDArray[np.intp]:
 @cache
 def record_size(model: Model) -> int:
     """Numbers in a record."""
-    return len(belief_names(model))
+    return len(belief_rows(model))
 
 
-def check_record(what: str, model: Model, record: FloatArray, rounding: float) -> None:
+def check_belief_record(argument_name: str, model: Model, record: FloatArray, eigenvalue_tolerance: float) -> None:
     """Refuse numbers (size,) that are not a belief of a model.
 
     Args:
-        what: names them in the message.
+        argument_name: names them in the message.
         model: whose belief.
         record: the numbers.
-        rounding: what may be left below zero of a covariance's eigenvalues, in units of its standard deviations.
+        eigenvalue_tolerance: what may be left below zero of a covariance's eigenvalues, in units of its standard deviations.
 
     Raises:
         ValueError: for numbers that are not finite, or beyond 1e30 (of the covariance, shapes and rates: 1e60), whose
@@ -50,27 +50,29 @@ def check_record(what: str, model: Model, record: FloatArray, rounding: float) -
             semi-definite.
     """
     if not np.isfinite(record).all():
-        bad = belief_names(model)[int(np.argmin(np.isfinite(record)))]
-        raise ValueError(f"{what} must be finite, but {bad} is not; replace it")
+        bad = belief_rows(model)[int(np.argmin(np.isfinite(record)))]
+        raise ValueError(f"{argument_name} must be finite, but {bad} is not; replace it")
     d = len(model.names)
-    most = np.where(np.arange(len(record)) < d, MAGNITUDE_BOUNDS[1], MAGNITUDE_BOUNDS[1] ** 2)
-    if (beyond := np.abs(record) > most).any():
+    limit = np.where(np.arange(len(record)) < d, MAGNITUDE_BOUNDS[1], MAGNITUDE_BOUNDS[1] ** 2)
+    if (beyond := np.abs(record) > limit).any():
         place = int(np.argmax(beyond))
         raise ValueError(
-            f"{what} must be within ±{most[place]:g}, but {belief_names(model)[place]} is {record[place]:g}; give "
+            f"{argument_name} must be within ±{limit[place]:g}, but {belief_rows(model)[place]} is {record[place]:g}; give "
             "numbers near 1, by scales that fit"
         )
     noises = record[-2 - 2 * model.n_outputs :]
     if (noises <= 0).any():
-        raise ValueError(f"{what} must have positive shapes and rates of the noises, but has {noises.tolist()}")
-    cov = record[covariance_places(model)]
+        raise ValueError(
+            f"{argument_name} must have positive shapes and rates of the noises, but has {noises.tolist()}"
+        )
+    cov = record[covariance_indices(model)]
     std = np.sqrt(np.maximum(np.diag(cov), 0.0))
     unit = np.where(std > 0, std, 1.0)
     with np.errstate(over="ignore"):
         correlations = cov / unit[:, None] / unit
-    unsound = (np.diag(cov) < 0).any() or (cov[std == 0] != 0).any() or not (np.abs(correlations) < 2).all()
-    if unsound or np.linalg.eigvalsh(correlations)[0] < -rounding * len(cov):
-        raise ValueError(f"{what} must have a positive semi-definite covariance, but has {cov.tolist()}")
+    is_indefinite = (np.diag(cov) < 0).any() or (cov[std == 0] != 0).any() or not (np.abs(correlations) < 2).all()
+    if is_indefinite or np.linalg.eigvalsh(correlations)[0] < -eigenvalue_tolerance * len(cov):
+        raise ValueError(f"{argument_name} must have a positive semi-definite covariance, but has {cov.tolist()}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ class Belief:
 
     Attributes:
         model: whose states and coefficients these are.
-        record: (size,) the numbers, as `estimator.engine.rows.belief_names` orders them: means, the upper triangle of
+        record: (size,) the numbers, as `estimator.engine.storage_layout.belief_rows` orders them: means, the upper triangle of
             the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
         scales: what one inside is worth outside, for physical parameters.
         factorisation: of the inference that made it; ``mean_field`` is the paper's.
@@ -108,7 +110,7 @@ class Belief:
                 f"record must have shape {(record_size(self.model),)} for the model {self.model.name!r}, but has "
                 f"{record.shape}; make it with Belief.of"
             )
-        check_record("record", self.model, record, 1e-9)
+        check_belief_record("record", self.model, record, 1e-9)
         record.flags.writeable = False
         object.__setattr__(self, "record", record)
 
@@ -159,7 +161,7 @@ class Belief:
         if np.any(np.abs(second - second.T) > 1e-9 * np.outer(std, std)):
             raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
         record[:d] = first
-        record[covariance_places(model)] = second
+        record[covariance_indices(model)] = second
         record[-len(noises) :] = noises
         return cls(model, record, **others)
 
@@ -167,13 +169,13 @@ class Belief:
         """Whether all numbers are the same, as Gymnasium's checker asks of two episodes of one seed."""
         if not isinstance(other, Belief):
             return NotImplemented
-        return self._kind == other._kind and np.array_equal(self.record, other.record)
+        return self._identity == other._identity and np.array_equal(self.record, other.record)
 
     def __hash__(self) -> int:
-        return hash((self._kind, self.record.tobytes()))
+        return hash((self._identity, self.record.tobytes()))
 
     @property
-    def _kind(self) -> tuple[Any, ...]:
+    def _identity(self) -> tuple[Any, ...]:
         return (self.model.digest, self.scales, self.factorisation)
 
     def with_records(self, records: FloatArray) -> list[Self]:
@@ -187,12 +189,12 @@ class Belief:
             beliefs.append(belief)
         return beliefs
 
-    def factorised(self, factorisation: str) -> Self:
+    def with_factorisation(self, factorisation: str) -> Self:
         """This belief as an inference of another factorisation begins with it.
 
         In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are left out.
         """
-        record, places, n = self.record.copy(), covariance_places(self.model), self.model.n_states
+        record, places, n = self.record.copy(), covariance_indices(self.model), self.model.n_states
         if factorisation == "mean_field":
             record[places[:n, n:]] = 0.0
             record[places[n:-1, -1]] = 0.0
@@ -216,7 +218,7 @@ class Belief:
     @property
     def cov(self) -> FloatArray:
         """(d, d) their covariance."""
-        return self.record[covariance_places(self.model)]
+        return self.record[covariance_indices(self.model)]
 
     @property
     def state_mean(self) -> FloatArray:
@@ -227,7 +229,7 @@ class Belief:
     def state_cov(self) -> FloatArray:
         """(n, n) covariance of the states."""
         n = self.model.n_states
-        return self.record[covariance_places(self.model)[:n, :n]]
+        return self.record[covariance_indices(self.model)[:n, :n]]
 
     @property
     def coefficients_mean(self) -> FloatArray:
@@ -238,7 +240,7 @@ class Belief:
     def coefficients_cov(self) -> FloatArray:
         """(K, K) covariance of the coefficients."""
         n = self.model.n_states
-        return self.record[covariance_places(self.model)[n:, n:]]
+        return self.record[covariance_indices(self.model)[n:, n:]]
 
     @property
     def noises(self) -> FloatArray:
@@ -262,7 +264,7 @@ class Belief:
 
     def entropy(self) -> float:
         """Entropy of the coefficients in nats; NaN where their covariance is singular."""
-        active, cov = self._unknown()
+        active, cov = self._uncertain_coefficients()
         sign, log_det = np.linalg.slogdet(cov)
         return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
 
@@ -284,7 +286,7 @@ class Belief:
             raise ValueError(f"coefficients must have shape (..., {size}), but has {points.shape}; pass one per name")
         if not np.isfinite(points).all():
             raise ValueError("coefficients must be finite, but has entries that are not; remove them")
-        active, cov = self._unknown()
+        active, cov = self._uncertain_coefficients()
         try:
             factor = np.linalg.cholesky(cov)
         except np.linalg.LinAlgError:
@@ -295,7 +297,7 @@ class Belief:
         value = -0.5 * ((whitened**2).sum(-1) + log_det + len(active) * np.log(2 * np.pi))
         return float(value) if np.ndim(value) == 0 else value
 
-    def _unknown(self) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    def _uncertain_coefficients(self) -> tuple[npt.NDArray[np.intp], FloatArray]:
         """The coefficients that are not known, and their covariance."""
         cov = self.coefficients_cov
         active = np.flatnonzero(np.diag(cov) != 0)

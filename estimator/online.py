@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.ensemble import Hypotheses, NoiseRatio
-from estimator.filter import Filter
 from estimator.inference import DEFAULT_ITERATIONS
+from estimator.inference.filter import Filter
+from estimator.inference.noise_grid import NoiseGridSize, NoiseRatio
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.priors import recorded_prior, silverbox_prior
 from estimator.rigs.rig import Channel, Rig
 from estimator.rigs.rig_prior import rig_prior
-from estimator.settings import Settings, settled
+from estimator.settings import EstimatorSettings, checked_settings
 from estimator.support.argument_checks import to_finite_series, to_scalar
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import show_progress as shown
@@ -49,7 +49,7 @@ class OnlineEstimator:
         expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
             ``sigma_points``, by points that spread as the belief does, for beliefs that are wide. By default the
             former, or the latter with a rig that brings the prior.
-        noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.ensemble`), structured only.
+        noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.inference.noise_grid`), structured only.
             With 1, the default, the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has
             the priors' own ratio among them. Each is there at three levels: a sample costs three updates a hypothesis.
             Two numbers, such as (5, 5), are values of σ_w and of σ_v, a factor of 3 apart, in all combinations: where
@@ -87,30 +87,31 @@ class OnlineEstimator:
         as_published: bool = False,
         drift: float = 0.0,
         expectations: str | None = None,
-        noise_hypotheses: Hypotheses | None = None,
+        noise_hypotheses: NoiseGridSize | None = None,
     ) -> None:
         rig = None if rig is None else Rig.of(rig)
-        of_rig = rig is not None and rig.guess is not None and model is None and prior is None
-        if of_rig:
+        rig_brings_prior = rig is not None and rig.guess is not None and model is None and prior is None
+        if rig_brings_prior:
             assert rig is not None
             prior = rig_prior(rig)
             model = prior.model
         if expectations is None:
-            expectations = "sigma_points" if of_rig else "first_order"
+            expectations = "sigma_points" if rig_brings_prior else "first_order"
         if noise_hypotheses is None:
-            noise_hypotheses = (7, 7) if of_rig else 1
+            noise_hypotheses = (7, 7) if rig_brings_prior else 1
         if not isinstance(model, Model | None):
             raise ValueError(f"model must be a Model, but is {model!r:.60}; use difference() or duffing()")
         self.model = difference() if model is None else model
         if iterations is None:
             iterations = DEFAULT_ITERATIONS["mean_field" if factorisation == "mean_field" else "structured"]
-        self.settings = settled(
-            self.model, Settings(factorisation, iterations, as_published, expectations, drift, noise_hypotheses)
+        self.settings = checked_settings(
+            self.model,
+            EstimatorSettings(factorisation, iterations, as_published, expectations, drift, noise_hypotheses),
         )
         self._free_energies = np.full((1, self.settings.iterations), np.nan)
         self._forecasts = np.empty((0, self.model.n_outputs, 2))
-        self._spare = np.empty_like(self._free_energies), np.empty((1, self.model.n_outputs, 2))
-        prior = _settled_prior(self.model, prior, self.settings)
+        self._spare_buffers = np.empty_like(self._free_energies), np.empty((1, self.model.n_outputs, 2))
+        prior = _checked_prior(self.model, prior, self.settings)
         if rig is None:
             units = Channel(prior.scales.input_unit), Channel(prior.scales.output_unit)
             rig = Rig(prior.step, *(("linear", 0) if self.model.is_continuous else ("zero_order", 1)), *units)
@@ -143,7 +144,7 @@ class OnlineEstimator:
 
         (T, sensors, 2) for several sensors, each given those before it of the same sample.
         """
-        return self._shown(self._forecasts, self.scales.output, self.scales.output**2)
+        return self._in_rig_units(self._forecasts, self.scales.output, self.scales.output**2)
 
     @property
     def noise_ratio(self) -> NoiseRatio:
@@ -157,9 +158,9 @@ class OnlineEstimator:
         return self._filter.noise_ratio
 
     @property
-    def waits(self) -> int:
+    def lookahead(self) -> int:
         """Samples that are used only when the next input is known: 1 where the rig looks ahead, else 0."""
-        return int(self._filter.feed.waits)
+        return int(self._filter.input_stencil.lookahead)
 
     def update(self, u: float, y: float | npt.ArrayLike) -> None:
         """Update the posterior with the sample (u, y); y holds a number for each sensor.
@@ -168,7 +169,7 @@ class OnlineEstimator:
             ValueError: if u or y is not a finite number, or drives the belief out of the range of floating-point
                 numbers. The estimator is then as it was before.
         """
-        if self._filter.feed.at_once:
+        if self._filter.input_stencil.needs_whole_record:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
         if self.model.n_outputs > 1:
             self.run(np.array([to_scalar("u", u)]), np.reshape(to_finite_series("y", y), (1, -1)))
@@ -181,17 +182,17 @@ class OnlineEstimator:
             )
         u, y = u / self.scales.input, y / self.scales.output
         used = not self._filter.is_waiting
-        free_energies, forecasts = self._spare
+        free_energies, forecasts = self._spare_buffers
         if self._filter.step(u, y, free_energies, forecasts) >= 0:
-            raise ValueError(_overflowed(0, u * self.scales.input, y * self.scales.output))
+            raise ValueError(_overflow_message(0, u * self.scales.input, y * self.scales.output))
         if not used:
             self._forecasts = forecasts[:0]
         else:
             # What the last sample left is overwritten by the next one but not before that has gone well.
-            last = self._free_energies, self._forecasts
+            previous = self._free_energies, self._forecasts
             self._free_energies, self._forecasts = free_energies, forecasts
-            fits = len(last[0]) == 1 and len(last[1]) == 1
-            self._spare = last if fits else (np.empty_like(free_energies), np.empty_like(forecasts))
+            fits = len(previous[0]) == 1 and len(previous[1]) == 1
+            self._spare_buffers = previous if fits else (np.empty_like(free_energies), np.empty_like(forecasts))
 
     def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False, missing: bool = False) -> FloatArray:
         """Update the posterior with T samples, in order. The same as `update` with each of them.
@@ -211,19 +212,19 @@ class OnlineEstimator:
         """
         if missing and self.settings.factorisation == "mean_field":
             raise ValueError("missing must be False in mean field, which takes all outputs; use structured")
-        u, outputs = self._record(u, y, missing)
+        u, outputs = self._checked_record(u, y, missing)
         free_energies = np.empty((len(u), self.settings.iterations))
         forecasts = np.empty((len(u), self.model.n_outputs, 2))
         if not len(u):
             return free_energies
         memory, used = self._filter.copy(), 0
-        for start, stop in self._chunks(len(u), progress):
+        for start, stop in self._progress_ranges(len(u), progress):
             new = stop - start - int(memory.is_waiting)
-            bad = memory.run(u[start:stop], outputs[start:stop], free_energies[used:], forecasts[used:])
-            if bad >= 0:
-                place = start + bad
-                told = (outputs[place] * self.scales.output).tolist()
-                raise ValueError(_overflowed(place, u[place] * self.scales.input, told))
+            overflowed_at = memory.run(u[start:stop], outputs[start:stop], free_energies[used:], forecasts[used:])
+            if overflowed_at >= 0:
+                place = start + overflowed_at
+                output = (outputs[place] * self.scales.output).tolist()
+                raise ValueError(_overflow_message(place, u[place] * self.scales.input, output))
             used += new
         self._filter = memory
         self._forecasts = forecasts[:used]
@@ -259,8 +260,8 @@ class OnlineEstimator:
             Predictions in the shape of y: of a filter that follows the record. Those of the paper's model are made from
             the last two outputs as measured, as the paper does, and the first two repeat y.
         """
-        u, outputs = self._record(u, y, False, least=2)
-        return self._shown(self._filter.predict(u, outputs), self.scales.output)
+        u, outputs = self._checked_record(u, y, False, min_length=2)
+        return self._in_rig_units(self._filter.predict(u, outputs), self.scales.output)
 
     def forecast(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Mean and variance of each output before it is seen, with the coefficients and noises fixed at their means.
@@ -272,8 +273,10 @@ class OnlineEstimator:
         Returns:
             (T, 2) or (T, sensors, 2).
         """
-        u, outputs = self._record(u, y, True)
-        return self._shown(self._filter.known().follow(u, outputs), self.scales.output, self.scales.output**2)
+        u, outputs = self._checked_record(u, y, True)
+        return self._in_rig_units(
+            self._filter.with_known_parameters().forecast(u, outputs), self.scales.output, self.scales.output**2
+        )
 
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
         """Free run with the coefficients fixed at their means, over all of u.
@@ -287,24 +290,24 @@ class OnlineEstimator:
             Simulated outputs (T,) or (T, sensors); inf or NaN from where the model diverges.
         """
         u = to_finite_series("u", u) / self.scales.input
-        outputs = self._outputs("y_init", y_init, False)
+        outputs = self._checked_outputs("y_init", y_init, False)
         if not 2 <= len(outputs) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(outputs)}")
-        return self._shown(self._filter.simulate(u, outputs), self.scales.output)
+        return self._in_rig_units(self._filter.simulate(u, outputs), self.scales.output)
 
-    def _record(
-        self, u: npt.ArrayLike, y: npt.ArrayLike, missing: bool, least: int = 0
+    def _checked_record(
+        self, u: npt.ArrayLike, y: npt.ArrayLike, missing: bool, min_length: int = 0
     ) -> tuple[FloatArray, FloatArray]:
         """Inputs (T,) and outputs (T, sensors), checked."""
-        inputs, outputs = to_finite_series("u", u), self._outputs("y", y, missing)
-        if len(inputs) != len(outputs) or len(inputs) < least:
-            wish = f" of at least {least}" if least else ""
+        inputs, outputs = to_finite_series("u", u), self._checked_outputs("y", y, missing)
+        if len(inputs) != len(outputs) or len(inputs) < min_length:
+            minimum = f" of at least {min_length}" if min_length else ""
             raise ValueError(
-                f"u and y must have one length{wish}, but have {len(inputs)} and {len(outputs)}; cut the longer one"
+                f"u and y must have one length{minimum}, but have {len(inputs)} and {len(outputs)}; cut the longer one"
             )
         return inputs / self.scales.input, outputs
 
-    def _outputs(self, name: str, y: npt.ArrayLike, missing: bool) -> FloatArray:
+    def _checked_outputs(self, name: str, y: npt.ArrayLike, missing: bool) -> FloatArray:
         sensors = self.model.n_outputs
         if sensors == 1:
             return to_finite_series(name, y, missing)[:, None] / self.scales.output
@@ -314,29 +317,29 @@ class OnlineEstimator:
         flat = np.ma.reshape(y, -1) if isinstance(y, np.ma.MaskedArray) else np.reshape(y, -1)
         return to_finite_series(name, flat, missing).reshape(shape) / self.scales.output
 
-    def _shown(self, told: FloatArray, *scales: float) -> FloatArray:
+    def _in_rig_units(self, values: FloatArray, *scales: float) -> FloatArray:
         """What the filter tells (T, sensors, ...), in the rig's units; (T, ...) of one sensor."""
-        return (told[:, 0] if self.model.n_outputs == 1 else told) * np.array(scales)
+        return (values[:, 0] if self.model.n_outputs == 1 else values) * np.array(scales)
 
-    def _chunks(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
+    def _progress_ranges(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
         """Ranges that cover all samples; one range without progress, else many, which are told."""
-        if not progress or self._filter.feed.at_once:
+        if not progress or self._filter.input_stencil.needs_whole_record:
             yield 0, samples
             return
-        with shown("Identifying") as tell:
+        with shown("Identifying") as report:
             for start in range(0, samples, _SAMPLES_BETWEEN_REPORTS):
-                tell(start / samples)
+                report(start / samples)
                 yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)
 
 
-def _overflowed(place: int, u: float, y: object) -> str:
+def _overflow_message(place: int, u: float, y: object) -> str:
     return (
         f"u and y must keep the belief finite, but near sample {place} (u = {u}, y = {y}) it overflowed; the estimator "
         f"is unchanged: check the sample's scale, or use a prior nearer to the system"
     )
 
 
-def _settled_prior(model: Model, prior: Belief | None, settings: Settings) -> Belief:
+def _checked_prior(model: Model, prior: Belief | None, settings: EstimatorSettings) -> Belief:
     """The prior, or the model's own; in mean field without what that leaves out."""
     if prior is None:
         if model.name not in ("difference", "duffing"):
@@ -347,4 +350,4 @@ def _settled_prior(model: Model, prior: Belief | None, settings: Settings) -> Be
             f"prior must be a Belief of the model, {model.name} with {tuple(model.coefficients)}, but is "
             f"{prior!r:.60}; see estimator.priors"
         )
-    return prior.factorised(settings.factorisation)
+    return prior.with_factorisation(settings.factorisation)

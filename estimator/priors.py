@@ -26,10 +26,10 @@ from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN, Fl
 
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.
-_NODES, _POINTS = 20, 160_000
+_MAX_NODES_PER_AXIS, _MAX_NODES = 20, 160_000
 
 #: Smallest and largest standard deviation: its square is a rate, of which precisions are made.
-_STDS = 1e-60, 1e60
+_STD_RANGE = 1e-60, 1e60
 
 
 def log_uniform_moments(
@@ -68,13 +68,13 @@ def _log_uniform_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """The integral of `log_uniform_moments`, with the parameters in their order."""
     names = list(model.physical or model.coefficients)
-    nodes_per_axis = max(2, min(_NODES, int(_POINTS ** (1 / len(names)) + 1e-9)))
+    nodes_per_axis = max(2, min(_MAX_NODES_PER_AXIS, int(_MAX_NODES ** (1 / len(names)) + 1e-9)))
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
     # log(1 ± spread) = log(1 - spread²) / 2 ± artanh(spread)
     factors = np.sqrt(1 - spread**2) * np.exp(np.arctanh(spread) * nodes)
     # The weights sum to 2, the length of [-1, 1].
-    axes = {name: (middle * factors, weights / 2) for name, middle in zip(names, center, strict=True)}
-    return moments(model, axes, scales)
+    axes = {name: (axis_center * factors, weights / 2) for name, axis_center in zip(names, center, strict=True)}
+    return quadrature_moments(model, axes, scales)
 
 
 def gaussian_moments(
@@ -97,18 +97,22 @@ def gaussian_moments(
     for name, given in (("mean", mean), ("std", std)):
         check_mapping(name, given)
         for parameter in names if name == "mean" else given:
-            check_number(f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STDS[1], _STDS[1])
-    nodes = max(2, min(7, int(_POINTS ** (1 / len(names)))))
-    return moments(model, {name: gaussian(mean[name], std.get(name, 0.0), nodes) for name in names}, scales)
+            check_number(
+                f"{name} of {parameter}", given.get(parameter), 0 if name == "std" else -_STD_RANGE[1], _STD_RANGE[1]
+            )
+    nodes = max(2, min(7, int(_MAX_NODES ** (1 / len(names)))))
+    return quadrature_moments(
+        model, {name: gauss_hermite(mean[name], std.get(name, 0.0), nodes) for name in names}, scales
+    )
 
 
-def gaussian(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
+def gauss_hermite(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
     """Points and weights (nodes,) of the quadrature over a Gaussian."""
     points, weights = np.polynomial.hermite_e.hermegauss(nodes)
     return mean + std * points, weights / weights.sum()
 
 
-def moments(
+def quadrature_moments(
     model: Model, axes: Mapping[str, tuple[FloatArray, FloatArray]], scales: Scales
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (K,) and covariance (K, K) of the coefficients of a plant whose parameters are independent.
@@ -158,12 +162,12 @@ def weak_prior(
         ValueError: for a value out of its range, or as `Belief`.
     """
     Model.require_model(model)
-    check_number("process_noise", process_noise, *_STDS)
-    check_number("noise_shape", noise_shape, *_STDS)
+    check_number("process_noise", process_noise, *_STD_RANGE)
+    check_number("noise_shape", noise_shape, *_STD_RANGE)
     n, k = model.n_states, model.n_coefficients
     for name, value, size in (("measurement_noise", measurement_noise, model.n_outputs), ("state_std", state_std, n)):
         for one in np.ravel(np.asarray(value, dtype=object)):
-            check_number(name, one, *_STDS)
+            check_number(name, one, *_STD_RANGE)
         if np.shape(value) not in ((), (size,)):
             raise ValueError(f"{name} must be one number or {size}, but has shape {np.shape(value)}")
     joint_mean, joint = np.zeros(n + k), np.zeros((n + k, n + k))
@@ -178,7 +182,7 @@ def weak_prior(
 
 
 #: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.plants.silverbox_twin`` identifies them).
-_TWINS = {"difference": SILVERBOX_TWIN, "duffing": SILVERBOX_ODE_TWIN}
+_SILVERBOX_TWINS = {"difference": SILVERBOX_TWIN, "duffing": SILVERBOX_ODE_TWIN}
 
 
 def silverbox_prior(
@@ -203,10 +207,10 @@ def silverbox_prior(
         ValueError: for a model with other parameters, or a value out of its range.
     """
     model = difference() if model is None else Model.require_model(model)
-    if model.name not in _TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
+    if model.name not in _SILVERBOX_TWINS or not {"m", "c", "a"} <= set(model.physical) <= {"m", "c", "a", "b"}:
         raise ValueError(f"model must have the parameters m, c, a and b, but {model.name} has {list(model.physical)}")
     check_number("spread", spread, 1e-9, 1 - 1e-9, "pass the range's relative half width")
-    moments = log_uniform_moments(model, _TWINS[model.name], spread)
+    moments = log_uniform_moments(model, _SILVERBOX_TWINS[model.name], spread)
     return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, state_std)
 
 
@@ -265,18 +269,18 @@ def recorded_prior(
         ValueError: for another model, or a value out of its range.
     """
     check_number("spread", spread, 0)
-    if Model.require_model(model).name not in _TWINS:
+    if Model.require_model(model).name not in _SILVERBOX_TWINS:
         raise ValueError(f"model must be a duffing or difference equation, but is {model.name}; use weak_prior")
     moments = _recorded_duffing(model, spread) if model.name == "duffing" else _recorded_difference(model, spread)
     prior = weak_prior(model, *moments, process_noise, measurement_noise, noise_shape, 0.1)
     if "output_offset" not in model.coefficients:
         return prior
     mean, cov = prior.mean, prior.cov
-    add_offset(model, mean, cov)
+    add_output_offset(model, mean, cov)
     return Belief.of(model, mean, cov, tuple(prior.noises[:2]), tuple(prior.noises[2:]))
 
 
-def add_offset(model: Model, mean: FloatArray, cov: FloatArray) -> None:
+def add_output_offset(model: Model, mean: FloatArray, cov: FloatArray) -> None:
     """Let the first state be the displacement with its offset: of moments (d,) and (d, d), in place."""
     place = model.names.index("output_offset")
     mean[0] += mean[place]

@@ -20,10 +20,10 @@ from estimator.support.argument_checks import short_repr
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
 #: Raised when the content of the files changes.
-FORMAT = 3
+FILE_FORMAT = 3
 
 #: No estimator needs more [bytes]; a file that claims more is refused before it is read.
-_LARGEST = 64 * 2**20
+_MAX_BYTES = 64 * 2**20
 
 
 def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
@@ -40,7 +40,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     if place.is_dir():
         raise ValueError(f"path must be the name of a file, but {place} is a folder; name a file in it")
     description = {
-        "format": FORMAT,
+        "format": FILE_FORMAT,
         "model": estimator.model.to_dict(),
         "rig": estimator.rig.to_dict(),
         "scales": asdict(estimator.scales),
@@ -59,9 +59,9 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
         FileNotFoundError: if there is no such file.
     """
-    place = check_readable_file(path, "path must be a file of save_estimator, identify --save or a run", _LARGEST)
+    place = check_readable_file(path, "path must be a file of save_estimator, identify --save or a run", _MAX_BYTES)
     try:
-        return _built(_read(place))
+        return _estimator_from(_read_arrays(place))
     except Exception as error:  # whatever the readers make of a foreign file
         raise ValueError(
             f"path must be a whole file of save_estimator, identify --save or a run, but {place} is not "
@@ -69,25 +69,25 @@ def load_estimator(path: str | Path) -> OnlineEstimator:
         ) from error
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_arrays(path: Path) -> dict[str, Any]:
     """The arrays of an archive."""
     with zipfile.ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
-    if size > _LARGEST:
+    if size > _MAX_BYTES:
         raise ValueError(f"it unpacks to {size} bytes")
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
 
-def _built(arrays: dict[str, Any]) -> OnlineEstimator:
+def _estimator_from(arrays: dict[str, Any]) -> OnlineEstimator:
     """The estimator that arrays describe."""
     text = arrays.pop("description")
     if text.dtype != np.uint8 or text.ndim != 1:
         raise ValueError("its description is of another version" if text.ndim == 0 else "its description is no text")
     description = json.loads(text.tobytes())
-    if not isinstance(description, dict) or description.get("format") != FORMAT:
+    if not isinstance(description, dict) or description.get("format") != FILE_FORMAT:
         found = description.get("format") if isinstance(description, dict) else None
-        raise ValueError(f"it is of format {found!r}, and this version reads {FORMAT}")
+        raise ValueError(f"it is of format {found!r}, and this version reads {FILE_FORMAT}")
     model, settings = Model(**description["model"]), description["settings"]
     rig, scales = Rig.from_dict(description["rig"]), Scales(**description["scales"])
     first = arrays.get("first")

@@ -90,7 +90,11 @@ class Bench:
 
 def around(plant, factorisation="structured", **options):
     """`VOLTS` around a plant, with the estimator of Amplitude-v0."""
-    usual = {"prior": silverbox_prior().factorised(factorisation), "noise_hypotheses": 1, "reward": "free_energy"}
+    usual = {
+        "prior": silverbox_prior().with_factorisation(factorisation),
+        "noise_hypotheses": 1,
+        "reward": "free_energy",
+    }
     usual |= {"max_input": 0.15, "max_output": 0.6, "factorisation": factorisation}
     return RigEnv(rig=VOLTS, plant=plant, **usual | options)
 

@@ -143,7 +143,7 @@ def test_nothing_else_stands_at_the_top():
     if listed.returncode:
         pytest.skip("not a git checkout")
     top = {line.split("/")[0] for line in listed.stdout.splitlines()}
-    expected = {"estimator", "duffing_env", "agents", "tests", "benchmarks", "docs", "examples"}
+    expected = {"estimator", "duffing_env", "agents", "research", "tests", "benchmarks", "docs", "examples"}
     expected |= {"train.py", "evaluate.py", "reproduce.py", "pyproject.toml", "requirements.lock", "Makefile"}
     expected |= {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "CITATION.cff", "SECURITY.md"}
     assert {name for name in top if not name.startswith(".")} <= expected

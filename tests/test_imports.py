@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 #: From the ground up; the scripts at the top of the repository may import all but the benchmarks.
-FLOORS = ("estimator", "duffing_env", "agents", "benchmarks")
+FLOORS = ("estimator", "duffing_env", "agents", "research", "benchmarks")
 SCRIPTS = ("train", "evaluate", "reproduce")
 
 

@@ -133,11 +133,11 @@ def test_numba_is_one_whose_insides_are_known():
     installed = version("numba")
     assert NUMBA.specifier.contains(installed, prereleases=True), (
         f"Numba {installed} is installed, and its insides are known with {NUMBA.specifier} only: see whether all tests "
-        "pass with it, then raise the bound in pyproject.toml and in estimator/numba_internals.py"
+        "pass with it, then raise the bound in pyproject.toml and in estimator/compilation/numba_internals.py"
     )
 
 
-@pytest.mark.parametrize("package", ["estimator.online", "estimator.straight", "duffing_env.kernel"])
+@pytest.mark.parametrize("package", ["estimator.online", "estimator.compilation.scalar_jit", "duffing_env.kernel"])
 def test_another_numba_is_refused_by_name(package):
     (newest,) = (bound.version for bound in NUMBA.specifier if bound.operator == "<")
     (oldest,) = (bound.version for bound in NUMBA.specifier if bound.operator == ">=")

@@ -10,8 +10,8 @@ from scipy import stats
 from agents.evaluation.plant_model import plant_model_of
 from duffing_env.plants.silverbox_record import load_record, regime_input
 from duffing_env.storage.kernel_spec import parameter_names
-from estimator.free_run import free_run
-from estimator.information import fisher_information
+from estimator.inference.fisher_information import fisher_information
+from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import coefficients_of, to_physical

@@ -21,8 +21,8 @@ from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.planning.d_optimality import NominalSystem
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from duffing_env.experiment_config import SimulatedExperiment
-from estimator.engine.feeding import input_degree
-from estimator.information import fisher_information, variances
+from estimator.engine.input_hold import input_degree
+from estimator.inference.fisher_information import fisher_information, noise_variances
 from estimator.models.difference_equation import difference
 from estimator.support.array_types import FloatArray
 from estimator.support.file_io import write_atomically
@@ -65,7 +65,7 @@ class TrackSystems:
             )
         plant = plant_model_of(experiment, envs.truth)
         precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
-        noise_variances = variances(plant.model, plant.process_noise, plant.sensor_noises)
+        noise_variances = noise_variances(plant.model, plant.process_noise, plant.sensor_noises)
         noise_variances = np.broadcast_to(noise_variances, (n_systems, noise_variances.shape[-1])).copy()
         return cls(experiment, plant.coefficients_of(envs.truth), precision, noise_variances)
 

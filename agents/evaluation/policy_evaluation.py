@@ -25,10 +25,10 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
 from estimator.belief import Belief
-from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.inference.batch_posteriors import posteriors
+from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
-from estimator.posteriors import posteriors
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales

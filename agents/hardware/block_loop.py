@@ -48,7 +48,7 @@ class SignalBlockDesigner:
         for k in range(samples):
             action, self._state = self._policy.predict(empty_observation, self._state)
             u[k] = self._env_view.max_input * action[0]
-        share, probability = futures.share(u, bound)
+        share, probability = futures.safe_scale(u, bound)
         return share * u, share, probability
 
 

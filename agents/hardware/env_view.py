@@ -11,7 +11,7 @@ import numpy.typing as npt
 from duffing_env.storage.kernel_spec import observation_bounds
 from duffing_env.tracks.rig_plant_env import RigPlantExperiment
 from estimator.belief import Belief
-from estimator.free_run import shown_at
+from estimator.inference.free_run import output_at
 from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
 
@@ -63,7 +63,7 @@ class EnvView:
             prior.noises[::2] / prior.noises[1::2]
         )
         if np.isnan(y):
-            y = shown_at(belief.model, belief.coefficients_mean, belief.state_mean, u)
+            y = output_at(belief.model, belief.coefficients_mean, belief.state_mean, u)
         values = np.concatenate([
             (belief.coefficients_mean - prior.coefficients_mean) / prior_stds,
             np.log(stds / prior_stds),

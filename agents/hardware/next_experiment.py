@@ -26,13 +26,13 @@ from agents.policies import make_policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
-from estimator.belief import Belief, covariance_places
-from estimator.free_run import free_run
+from estimator.belief import Belief, covariance_indices
 from estimator.identification.data.column_names import name_with_unit, unit_in_name
 from estimator.identification.diagnostics.validity_checks import (
     MIN_SAMPLES_PER_PERIOD,
     RECOMMENDED_SAMPLES_PER_PERIOD,
 )
+from estimator.inference.free_run import free_run
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import rig_prior
@@ -191,7 +191,7 @@ def design_experiment(
         )  # fmt: skip
     gain = log_det_gain + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
     expected_stds = _expected_stds(belief, systems, covs)
-    outputs = futures.shown(u, slice(_N_PREDICTED_SYSTEMS))
+    outputs = futures.simulate_outputs(u, slice(_N_PREDICTED_SYSTEMS))
     outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
     output_quantiles = belief.scales.output * np.quantile(outputs, _OUTPUT_QUANTILES, axis=0)
     return ExperimentDesign(
@@ -228,7 +228,7 @@ def _expected_stds(belief: Belief, systems: SampledSystems, covs: FloatArray) ->
 
 def _belief_record_at_rest(belief: Belief) -> FloatArray:
     """A belief's record, with the state at rest."""
-    n, places, record = belief.model.n_states, covariance_places(belief.model), belief.record.copy()
+    n, places, record = belief.model.n_states, covariance_indices(belief.model), belief.record.copy()
     record[:n] = 0.0
     record[0] = equilibria(belief.model, belief.coefficients_mean)[0]
     record[places[:n]] = 0.0
@@ -288,5 +288,5 @@ def _roll_out_policy(
         u[t] = env_view.max_input * float(action[0])
         if terminated or truncated:
             break
-    scale, probability = futures.share(u, bound)
+    scale, probability = futures.safe_scale(u, bound)
     return scale * u, scale, probability

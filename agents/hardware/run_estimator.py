@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from agents.planning.model_probe import believed_resonance, local_dynamics
 from agents.planning.open_loop.posterior_samples import SystemDraws, draw_from_estimator
-from estimator.arrays import copy as copy_numbers
-from estimator.belief import Belief, covariance_places
-from estimator.engine.motion import motion
+from estimator.belief import Belief, covariance_indices
+from estimator.compilation.array_operations import copy as copy_numbers
+from estimator.compilation.simd import kernel
+from estimator.engine.noise_free_response import compile_noise_free_response
 from estimator.identification.fitting.posterior_belief import refit_coefficients
-from estimator.lanes import kernel
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.rigs.rig import Rig
@@ -36,11 +36,11 @@ _DIVERGED_OUTPUT = 3.0
 @cache
 def _compile_free_response(model: Model) -> Any:
     """``free_response(systems, u, lengths)``: states in rows, behind them coefficients, after a sample with u and pauses."""
-    kernels = motion(model)
+    kernels = compile_noise_free_response(model)
     layout, step, n = kernels.layout, kernels.step, model.n_states
     size, n_variables, input_index = len(layout), len(model.names), layout["INPUT"]
 
-    @kernel(kind=f"{model.name}_{model.digest}")
+    @kernel(variant=f"{model.name}_{model.digest}")
     def free_response(systems, u, lengths):
         W = np.zeros(size)
         for i in range(len(systems)):
@@ -220,14 +220,14 @@ class RunEstimator:
 
     def _set_state(self, mean: FloatArray, cov: FloatArray) -> None:
         arrays, model = self.online.arrays(), self.online.model
-        n, places = model.n_states, covariance_places(model)
+        n, places = model.n_states, covariance_indices(model)
         arrays["records"][:, :n] = mean
         arrays["records"][:, places[:n, :n]] = cov
         self.online.restore(arrays)
 
     def _set_coefficients(self, mean: FloatArray, cov: FloatArray) -> None:
         arrays, model = self.online.arrays(), self.online.model
-        n, d, places = model.n_states, len(model.names), covariance_places(model)
+        n, d, places = model.n_states, len(model.names), covariance_indices(model)
         arrays["records"][:, n:d] = mean
         arrays["records"][:, places[n:, n:]] = cov
         arrays["records"][:, places[:n, n:]] = 0.0

@@ -1,6 +1,6 @@
 """What a plan would teach and cost, imagined on a belief of any model, compiled across lanes.
 
-What it teaches is `estimator.engine.imagination`'s: belief propagation along the plan's trajectory. Here stands what a
+What it teaches is `estimator.engine.expected_update`'s: belief propagation along the plan's trajectory. Here stands what a
 plan is judged by besides. Plans lie in the lanes of a block, so that the compiler imagines several at a time.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import stdtrit
 
 from agents.planning.d_optimality import half_log_det, invert_from_cholesky
-from estimator.engine.imagination import LOST, imagination
-from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, jit, lanewise, part
+from estimator.compilation.simd import LANES, jit, jit_closure, lanewise
+from estimator.engine.expected_update import DIVERGED_SCORE, compile_expected_update
+from estimator.engine.storage_layout import belief_rows
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -178,14 +178,14 @@ def _stage_cost(
 def _net_information(KNOWN, COST):
     """What is known, less the cost; also of a plan whose numbers are no longer finite."""
     score = KNOWN - COST
-    return score if score > LOST else LOST
+    return score if score > DIVERGED_SCORE else DIVERGED_SCORE
 
 
 @cache
 def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> BeliefRollout:
-    """The imagination of a model; arguments as `estimator.engine.imagination.imagination`."""
-    expected_update = imagination(model, degree, lag)
-    place, names = expected_update.layout, belief_names(model)
+    """The imagination of a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
+    expected_update = compile_expected_update(model, degree, lag)
+    place, names = expected_update.layout, belief_rows(model)
     size, n_carried = len(place) * LANES, expected_update.kept * LANES
     k, n_record = model.n_coefficients, model.n_states + model.n_coefficients
     n_states = model.n_states
@@ -199,11 +199,11 @@ def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> Belie
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES
     noise_index = names.index("GAMMA_SHAPE") + 2
-    advance_belief, judge = expected_update.advance, expected_update.judge
+    advance_belief, judge = expected_update.advance, expected_update.final_information
     uniform = "noise shaken limit margin firm price goal goal_weight amplitude reach"
     stage_cost = lanewise(place, "COST MARGIN NEAR", uniform=uniform)(_stage_cost)
     net_information = lanewise(place, "SCORE")(_net_information)
-    compile_inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+    compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
 
     @compile_inner
     def load_belief(W, record, previous_inputs):

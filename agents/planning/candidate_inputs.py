@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from duffing_env.storage.random_streams import sfc64_next, to_uniform
-from estimator.lanes import jit
+from estimator.compilation.simd import jit
 
 #: Inputs to choose from, in parts of the largest. Of what is further off in a plan, the first five will do, then two.
 INPUT_FRACTIONS = (1.0, -1.0, 0.0, 0.5, -0.5, 0.75, -0.75, 0.25, -0.25)

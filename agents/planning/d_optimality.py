@@ -1,7 +1,7 @@
 """The worth of a sequence of inputs, and its exact gradient, compiled for any model: what oracle and planner climb.
 
 The worth is ½ log det(Λ + F(u)) in nats, with F the Fisher information of the model's coefficients along the response
-without noise (`estimator.information`) and Λ what is known before, less a penalty where the first sensor's signal x
+without noise (`estimator.inference.fisher_information`) and Λ what is known before, less a penalty where the first sensor's signal x
 goes beyond a limit L:
 
     J(u) = ½ log det(Λ + F(u)) - ρ Σ_t max(0, |x_t| / L - 1)²
@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.arrays import copy_scaled, fill
-from estimator.engine.feeding import older_inputs
-from estimator.engine.gradient import pieces
-from estimator.lanes import jit, kernel, part
+from estimator.compilation.array_operations import copy_scaled, fill
+from estimator.compilation.simd import jit, jit_closure, kernel
+from estimator.engine.adjoint import compile_adjoint
+from estimator.engine.input_hold import n_older_inputs
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -39,7 +39,7 @@ class NominalSystem(NamedTuple):
     Attributes:
         coefficients: (K,) the model's.
         precision: (K, K) Λ.
-        noises: variances of the process noise and of each sensor's (`estimator.information.variances`).
+        noises: variances of the process noise and of each sensor's (`estimator.inference.fisher_information.noise_variances`).
     """
 
     coefficients: FloatArray
@@ -76,7 +76,7 @@ class DOptimality(NamedTuple):
             trajectory that is lost (`DIVERGED_RATIO`) counts what it told until then.
         criterion_and_gradient: as ``criterion``, and fills in ``workspace.gradient``.
         input_at: ``input_at(start, u, t)``: the input at sample t, which may lie before the first.
-        path_functions: `estimator.engine.gradient.pieces`, for those who follow a path themselves.
+        path_functions: `estimator.engine.adjoint.compile_adjoint`, for those who follow a path themselves.
     """
 
     start_size: int
@@ -96,36 +96,36 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
         model: the equation.
         degree: of the input's polynomial over a sample: 0 held, 1 linear.
     """
-    path_functions = pieces(model, degree)
+    path_functions = compile_adjoint(model, degree)
     begin, coefficients_of, lay, step, back = (
         path_functions.begin,
         path_functions.coefficients,
-        path_functions.lay,
+        path_functions.input_coefficients,
         path_functions.step,
-        path_functions.back,
+        path_functions.backward,
     )
     gather, seed, n_path, n_tape = (
-        path_functions.gather,
-        path_functions.seed,
+        path_functions.add_information,
+        path_functions.seed_adjoint,
         path_functions.n_path,
         path_functions.n_tape,
     )
-    k, n_older_inputs = model.n_coefficients, older_inputs(model, degree)
+    k, n_older = model.n_coefficients, n_older_inputs(model, degree)
     compile_key = f"{model.name}_{model.digest}_{degree}"
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def workspace(samples):
         return GradientWorkspace(
             np.empty((samples, n_tape)), np.empty(samples), np.empty((k, k)), np.empty((k, k)), np.empty(samples)
         )
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def input_at(start, u, t):
         if t >= 0:
             return u[t]
-        return start[n_path - 1 - t] if n_older_inputs >= -t else 0.0
+        return start[n_path - 1 - t] if n_older >= -t else 0.0
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def simulate(nominal, limit, start, u, memory):
         """Follow the inputs; gives the steps that were followed, the peak of |x|, and Σ max(0, |x| / L - 1)²."""
         tape, output_signal, noises = memory.tape, memory.output_signal, nominal.noises
@@ -146,12 +146,12 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
         gather(F, nominal.precision, memory.F)
         return steps, peak, excess
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def criterion(nominal, limit, penalty, start, u, memory):
         _, peak, excess = simulate(nominal, limit, start, u, memory)
         return half_log_det(memory.F) - penalty * excess, peak
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def criterion_and_gradient(nominal, limit, penalty, start, u, memory):
         steps, peak, excess = simulate(nominal, limit, start, u, memory)
         value = half_log_det(memory.F)
@@ -166,15 +166,13 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
             U = lay(u[t], input_at(start, u, t - 1), input_at(start, u, t - 2))
             G, slope_now, slope_last, slope_older = back(G, H, C, U, noises, output_slope, tape, t)
             gradient[t] += slope_now
-            if n_older_inputs > 0 and t > 0:
+            if n_older > 0 and t > 0:
                 gradient[t - 1] += slope_last
-            if n_older_inputs > 1 and t > 1:
+            if n_older > 1 and t > 1:
                 gradient[t - 2] += slope_older
         return value - penalty * excess, peak
 
-    return DOptimality(
-        n_path + n_older_inputs, n_path, workspace, criterion, criterion_and_gradient, input_at, path_functions
-    )
+    return DOptimality(n_path + n_older, n_path, workspace, criterion, criterion_and_gradient, input_at, path_functions)
 
 
 @jit

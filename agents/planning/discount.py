@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from agents.planning.model_probe import TimeScales
-from estimator.lanes import jit
+from estimator.compilation.simd import jit
 
 #: What a plan teaches counts e times less so many moves later, or so much of the moves that a swing takes to come near
 #: the limit, and at most so many: where a swing has to be built for long, it pays late. Chosen on `validation`.

@@ -18,10 +18,10 @@ from agents.planning.belief_rollout import MAX_MARGIN_FRACTION, objective_at
 from agents.planning.candidate_inputs import next_uniform
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient, project_input
-from estimator.arrays import copy
-from estimator.belief import covariance_places
-from estimator.engine.rows import belief_names
-from estimator.lanes import kernel, part
+from estimator.belief import covariance_indices
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import jit_closure, kernel
+from estimator.engine.storage_layout import belief_rows
 from estimator.models.model import Model
 
 #: Input before and after a burst, in parts of that within.
@@ -79,7 +79,7 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
     begin_path, coefficients_of, lay, step = (
         d_optimality.path_functions.begin,
         d_optimality.path_functions.coefficients,
-        d_optimality.path_functions.lay,
+        d_optimality.path_functions.input_coefficients,
         d_optimality.path_functions.step,
     )
     n, k, sensors = model.n_states, model.n_coefficients, model.n_outputs
@@ -87,11 +87,11 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
     sensitivity_start = n + n * (n + 1) // 2  # of the sensitivities in a start
     as_noises, covariance, noise = (
         d_optimality.path_functions.noises,
-        covariance_places(model),
-        belief_names(model).index("GAMMA_SHAPE"),
+        covariance_indices(model),
+        belief_rows(model).index("GAMMA_SHAPE"),
     )
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def start_from_belief(record, precision, start):
         work = np.empty((k, k))
         for a in range(k):
@@ -116,7 +116,7 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
                 start[place] = max(0.0, value) if a == b else value
                 place += 1
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def free_response(nominal, start, previous_input, tape):
         """The signals of two samples without input, and the first one's predictive variance."""
         C = coefficients_of(nominal.coefficients)
@@ -125,7 +125,7 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
         _, _, next_output, _ = step(P, F, C, lay(0.0, 0.0, previous_input), nominal.noises, tape, 0)
         return x, next_output, output_variance
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def resonant_burst(nominal, start, limit, energy, is_first_plan, u, rng_state, tape):
         """A burst (T,) that pushes as the signal moves, from a random sample on; weak before and after it.
 
@@ -150,7 +150,7 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
                 P, F = begin_path(np.zeros(start_size))
                 x = 0.0
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def plan_rest_of_episode(records, samples_left, energies, objective, previous_input, plans, rng_state, actions):
         T = plans.shape[1]
         start, precision, coefficients = np.zeros(start_size), np.empty((k, k)), np.empty(k)
@@ -196,7 +196,7 @@ def compile_energy_limited_plan(model: Model, degree: int = 0) -> EnergyLimitedP
                     u[t] *= 0.5
             actions[i] = u[0]
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def resonant_bursts(nominal, limit, energy, inputs, rng_state):
         tape, start = workspace_for(1).tape, np.zeros(start_size)
         for i in range(len(inputs)):

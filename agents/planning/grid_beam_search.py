@@ -23,11 +23,11 @@ import numpy as np
 
 from agents.planning.belief_rollout import compile_belief_rollout
 from agents.planning.candidate_inputs import INPUT_FRACTIONS, allowed_input, next_uniform
-from estimator.arrays import aligned, copy, highest
-from estimator.engine.imagination import imagination
-from estimator.lanes import LANES, jit, lanewise, part
+from estimator.compilation.array_operations import aligned_matrix, copy, index_of_max
+from estimator.compilation.scalar_jit import scalar_jit
+from estimator.compilation.simd import LANES, jit, jit_closure, lanewise
+from estimator.engine.expected_update import compile_expected_update
 from estimator.models.model import Model
-from estimator.straight import straight
 
 #: Where not all inputs are tried, so many are, and far ahead so many.
 _N_INPUTS_NEAR, _N_INPUTS_FAR = 5, 2
@@ -61,7 +61,7 @@ class BeamWorkspace(NamedTuple):
     """What is written on.
 
     Attributes:
-        beam_width: blocks of the ways that are followed.
+        beams: blocks of the ways that are followed.
         continuations: blocks of their continuations.
         parents: (horizon, ways) of which way each continues.
         inputs: (horizon, ways) with which input.
@@ -71,7 +71,7 @@ class BeamWorkspace(NamedTuple):
         source_offsets: (ways,) where the continuations begin that become ways.
     """
 
-    beam_width: Any
+    beams: Any
     continuations: Any
     parents: Any
     inputs: Any
@@ -119,21 +119,21 @@ class SearchProblem(NamedTuple):
 
 @cache
 def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> GridBeamSearch:
-    """The ways through the map of a model; arguments as `estimator.engine.imagination.imagination`."""
+    """The ways through the map of a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
     rollout = compile_belief_rollout(model, degree, lag)
     size, n_carried, U, SCORE = rollout.size, rollout.kept, rollout.input_row, rollout.score_row
     load_belief, advance, evaluate = rollout.load_belief, rollout.advance, rollout.evaluate
-    states = {"FIRST": 0, "SECOND": 1, "CELL": imagination(model, degree, lag).layout["CELL"]}
+    states = {"FIRST": 0, "SECOND": 1, "CELL": compile_expected_update(model, degree, lag).layout["CELL"]}
     CELL = states["CELL"] * LANES
     in_line = lanewise(states, "CELL", uniform="sign right cells scale")(_cell_on_line)
     in_plane = lanewise(states, "CELL", uniform="sign right up cells scale other")(_cell_in_plane)
     is_plane = model.n_states > 1
-    compile_inner = part(f"{model.name}_{model.digest}_{degree}_{lag}")
+    compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
 
     @compile_inner
     def workspace(horizon, beams):
         blocks = beams // LANES
-        beam_blocks, continuations = aligned(blocks, size), aligned(len(INPUT_FRACTIONS) * blocks, size)
+        beam_blocks, continuations = aligned_matrix(blocks, size), aligned_matrix(len(INPUT_FRACTIONS) * blocks, size)
         parents, inputs = np.empty((horizon, beams), np.int64), np.empty((horizon, beams))
         most = len(INPUT_FRACTIONS) * beams
         scores, best_continuations, visited_cells = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
@@ -238,7 +238,7 @@ def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> Gri
             count = select_beams(
                 memory, h, problem.beam_width if h < problem.n_moves_some_inputs else problem.far_beam_width, n_reached
             )
-        beam = highest(scores, count)
+        beam = index_of_max(scores, count)
         for h in range(problem.n_moves - 1, -1, -1):
             found[h] = inputs[h, beam]
             beam = parents[h, beam]
@@ -255,7 +255,7 @@ def first_input(size_index, problem):
 @jit
 def score_threshold(scores, max_count):
     """A score that no more than ``max_count`` of them reach, but where more are the highest, and none that is hopeless."""
-    high = scores[highest(scores, len(scores))]
+    high = scores[index_of_max(scores, len(scores))]
     low = high - _PRUNE_GAP
     if _count_reaching(scores, low) <= max_count:
         return low
@@ -277,7 +277,7 @@ def _count_reaching(scores, threshold):
     return count
 
 
-@straight
+@scalar_jit
 def _axis_cell(x, scale, cells, offset):
     """The cell along one axis; the first for a state that is not a number."""
     position = (x / scale + 1.0) * 0.5 * (cells - 1) + offset

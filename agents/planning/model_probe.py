@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.storage.kernel_spec import observation_bounds
-from estimator.arrays import copy, fill
 from estimator.belief import Belief
-from estimator.engine.motion import motion
-from estimator.lanes import kernel
+from estimator.compilation.array_operations import copy, fill
+from estimator.compilation.simd import kernel
+from estimator.engine.noise_free_response import compile_noise_free_response
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -47,7 +47,7 @@ class ModelView(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """What tells the functions compiled for it from those for others (`estimator.lanes.part`)."""
+        """What tells the functions compiled for it from those for others (`estimator.compilation.simd.jit_closure`)."""
         return f"{self.model.name}_{self.model.digest}_{self.degree}_{self.lag}"
 
 
@@ -96,7 +96,7 @@ class LocalDynamics(NamedTuple):
     Attributes:
         outputs_shown: (n,) what the first sensor shows.
         velocities: (n,) its velocity.
-        input_gains: (n,) the gain (`estimator.engine.motion`).
+        input_gains: (n,) the gain (`estimator.engine.noise_free_response`).
         jacobians: (n, states, states) of the linear part.
         regressors: (n, K) derivatives of a sample's moves by the coefficients, under an input that is on.
     """
@@ -111,19 +111,19 @@ class LocalDynamics(NamedTuple):
 @cache
 def _compile_local_dynamics(model: Model) -> Any:
     """``local_dynamics(means, states, inputs, free_response)`` fills in a `LocalDynamics`."""
-    free_response = motion(model)
+    free_response = compile_noise_free_response(model)
     at, sense, linearise, regress = (
         free_response.layout,
-        free_response.sense,
+        free_response.output_now,
         free_response.linearise,
-        free_response.regress,
+        free_response.regressors,
     )
     n, k, size, u = model.n_states, model.n_coefficients, len(at), at["INPUT"]
     now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
     state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
     linear, first = at[f"A_{state}_{state}"], at[f"E_{coefficient}"]
 
-    @kernel(kind=f"{model.name}_{model.digest}")
+    @kernel(variant=f"{model.name}_{model.digest}")
     def survey(means, states, inputs, found):
         W = np.zeros(size)
         for i in range(len(means)):
@@ -250,8 +250,13 @@ def _compile_pumped_swing(view: ModelView) -> Any:
     These are the peaks of states and sensor, samples in a period, or 0, samples until the limit is near, or 0, and how
     far the largest input moves what the first sensor shows after a sample from rest.
     """
-    free_response = motion(*view)
-    at, sense, glance, step = free_response.layout, free_response.sense, free_response.glance, free_response.step
+    free_response = compile_noise_free_response(*view)
+    at, sense, glance, step = (
+        free_response.layout,
+        free_response.output_now,
+        free_response.output_after,
+        free_response.step,
+    )
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
     u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
@@ -259,7 +264,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)
     velocity = at[rate] if rate in states else velocity
 
-    @kernel(kind=view.kind)
+    @kernel(variant=view.kind)
     def swing(means, max_input, limit, peaks, mean_information):
         W = np.zeros(size)
         copy(W, n, means, k)

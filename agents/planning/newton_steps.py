@@ -20,8 +20,8 @@ import numpy as np
 
 from agents.planning.belief_rollout import MARGIN_COST
 from agents.planning.d_optimality import half_log_det, solve_from_cholesky
-from estimator.arrays import copy, fill
-from estimator.lanes import LANES, jit
+from estimator.compilation.array_operations import copy, fill
+from estimator.compilation.simd import LANES, jit
 
 #: Inputs of a plan that are changed together; later ones are planned again before they are played.
 _MAX_CHANGED_INPUTS = 20

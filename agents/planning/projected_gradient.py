@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality
-from estimator.arrays import copy
-from estimator.lanes import jit, kernel, part
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import jit, jit_closure, kernel
 from estimator.models.model import Model
 
 #: The gradient aims at this much of the displacement limit, so that what it ends with is within the limit itself.
@@ -77,7 +77,7 @@ def compile_projected_gradient(model: Model, degree: int = 0) -> ProjectedGradie
     )
     compile_key = f"{model.name}_{model.digest}_{degree}"
 
-    @part(compile_key)
+    @jit_closure(compile_key)
     def ascend(nominal, limits, first_step, iterations, start, u, best, workspace):
         copy(best, 0, u, len(u))
         best_value = -np.inf
@@ -102,7 +102,7 @@ def compile_projected_gradient(model: Model, degree: int = 0) -> ProjectedGradie
         copy(u, 0, best, len(u))
         return best_value
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def ascend_batch(nominal, limits, first_step, iterations, inputs, values):
         start, workspace, best = np.zeros(start_size), workspace_for(inputs.shape[1]), np.empty(inputs.shape[1])
         soft_limits = DesignLimits(limits.output, _SOFT_LIMIT_FRACTION * limits.output, limits.amplitude, limits.energy)
@@ -114,7 +114,7 @@ def compile_projected_gradient(model: Model, degree: int = 0) -> ProjectedGradie
             if not peak <= limits.output:
                 values[i] = -np.inf
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def evaluate_batch(coefficients, precision, noises, limit, inputs, values, peaks):
         start, workspace = np.zeros(start_size), workspace_for(inputs.shape[1])
         for i in range(len(inputs)):

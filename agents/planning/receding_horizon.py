@@ -28,8 +28,8 @@ from agents.planning.d_optimality import factorise_information
 from agents.planning.discount import discount_weight_drop, fill_discount_weights, filter_delay_in_moves
 from agents.planning.grid_beam_search import SearchProblem, compile_grid_beam_search
 from agents.planning.newton_steps import empty_candidate_batch, fill_finite_differences, fill_newton_candidates
-from estimator.arrays import copy, fill, highest
-from estimator.lanes import LANES, jit, kernel, part
+from estimator.compilation.array_operations import copy, fill, index_of_max
+from estimator.compilation.simd import LANES, jit, jit_closure, kernel
 from estimator.models.model import Model
 
 #: Of so many cells of the map, one way that leads into them is followed, in so many blocks at least, and at most. Far
@@ -101,7 +101,7 @@ class RecedingHorizon(NamedTuple):
 
 @cache
 def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> RecedingHorizon:
-    """The search for a model; arguments as `estimator.engine.imagination.imagination`."""
+    """The search for a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
     rollout = compile_belief_rollout(model, degree, lag)
     size, U, SCORE, NEAR, NOISE = (
         rollout.size,
@@ -115,7 +115,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
     workspace, find_best_plan = compile_grid_beam_search(model, degree, lag)
     k = model.n_coefficients
     compile_key = f"{model.name}_{model.digest}_{degree}_{lag}"
-    compile_inner, compile_entry = part(compile_key), kernel(kind=compile_key)
+    compile_inner, compile_entry = jit_closure(compile_key), kernel(variant=compile_key)
 
     @compile_inner
     def evaluate_plans(W, problem, batch):
@@ -159,7 +159,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
                 mutate_plan(candidates[j], problem.n_moves, objective.amplitude, rng_state)
             limit_slew(candidates[j], problem.n_moves, problem.previous_inputs[0], objective)
         evaluate_plans(W, problem, batch)
-        winner = highest(batch.scores, LANES)
+        winner = index_of_max(batch.scores, LANES)
         if not batch.scores[winner] > score:
             return score
         copy(best, 0, candidates[winner], len(best))
@@ -243,7 +243,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
 
         They began one move of so many samples ago.
         """
-        W = memory.ways[0]
+        W = memory.beams[0]
         moves = min(len(best), _FINAL_HORIZON)
         beam_width, far_beam_width = beam_widths(objective.cells, objective.hard_margin > 0.0)
         hold = hold_samples_for(samples_left, moves, objective.hold_samples)
@@ -284,7 +284,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
         select_starts(W, problem, batch, starts, scores, end_precisions, rng_state)
         waiting, best_score = scores.copy(), -np.inf
         for _ in range(n):
-            s = highest(waiting, n)
+            s = index_of_max(waiting, n)
             if waiting[s] < best_score - _PRUNE_GAP:
                 break
             waiting[s] = -np.inf
@@ -292,7 +292,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
                 W, problem, batch, starts[s], scores[s], end_precisions[s], rounds, best_score, rng_state
             )
             best_score = max(best_score, scores[s])
-        winner = highest(scores, n)
+        winner = index_of_max(scores, n)
         copy(best, 0, starts[winner], len(best))
         fill(runner_up, 0.0)
         second = -np.inf

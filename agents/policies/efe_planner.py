@@ -60,7 +60,7 @@ from agents.planning.model_probe import (
 )
 from agents.planning.receding_horizon import compile_receding_horizon
 from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
-from estimator.engine.motion import coarsened
+from estimator.engine.noise_free_response import with_coarse_substeps
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
 from estimator.support.array_types import FloatArray
 
@@ -121,7 +121,7 @@ class EfePlanner:
         horizon: moves to plan for, each held for at most ``objective.hold_samples`` samples, but no longer than the episode needs;
             by default 44, and the whole episode sample by sample where the energy is limited. No more than 24 of the
             last 48 of an episode.
-        rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.lanes.LANES`
+        rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.compilation.simd.LANES`
             each; one that brings less than 0.00005 nats is the last. Of no effect on a plan of the whole episode.
         risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
         goal: mean of the goal prior of what the first sensor shows, within its limit.
@@ -191,7 +191,7 @@ class EfePlanner:
         self._energy = setup.budget if plans_whole_episode else None
         if plans_whole_episode:
             self._plan_rest_of_episode = compile_energy_limited_plan(
-                coarsened(self.model_view.model), self.model_view.degree
+                with_coarse_substeps(self.model_view.model), self.model_view.degree
             ).plan_rest_of_episode
         self._env = env
         self.seed = seed

@@ -205,7 +205,9 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
     if getattr(experiment, "rig", None) is not None:
         hold = hold_for_resonance(experiment.prior_belief, samples)
         silverbox_draw = EXCITATIONS[name](DEFAULT_MAX_INPUT)
-        draw = partial(_stretched_draw, draw=silverbox_draw, hold=hold, amplitude_ratio=limits.max_input / DEFAULT_MAX_INPUT)
+        draw = partial(
+            _stretched_draw, draw=silverbox_draw, hold=hold, amplitude_ratio=limits.max_input / DEFAULT_MAX_INPUT
+        )
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
         draw, samples = draw_recorded(recorded), len(recorded)

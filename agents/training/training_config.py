@@ -16,7 +16,7 @@ from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparam
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters
 from agents.user_code import check_env_options, env_spec_of
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 from estimator.support.argument_checks import check_choice, check_integer, check_mapping, is_finite_number, short_repr
 from estimator.support.file_io import check_readable_file
 from estimator.support.optional_dependencies import require_packages

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks.fuzz.bad_values import another_array, anything
 from benchmarks.fuzz.call_verdicts import Call
 from estimator import Channel, OnlineEstimator, Rig, difference, duffing, silverbox_prior
-from estimator.belief import check_record
+from estimator.belief import check_belief_record
 
 _GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
 RIG = Rig(1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6), guess=_GUESS)
@@ -45,7 +45,7 @@ def _state(estimator: OnlineEstimator) -> Any:
 def sound(estimator: OnlineEstimator) -> str:
     """What is wrong with an estimator's belief, or nothing."""
     try:
-        check_record("belief", estimator.model, estimator.belief.record, 1e-5)
+        check_belief_record("belief", estimator.model, estimator.belief.record, 1e-5)
     except ValueError as error:
         return str(error).split(",")[0]
     return ""

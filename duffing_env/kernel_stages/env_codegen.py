@@ -17,22 +17,22 @@ from duffing_env.storage.kernel_spec import (
     observation_bounds,
     parameter_names,
 )
-from estimator.engine import cache as stored
-from estimator.engine.rows import belief_names
-from estimator.engine.tasks import NAMES
-from estimator.lanes import LANES, source_digest, sources_of
+from estimator.compilation.scalar_jit import scalar_jit
+from estimator.compilation.simd import LANES, source_digest, source_folders
+from estimator.engine import source_cache as stored
+from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.storage_layout import belief_rows
 from estimator.models.model import Model
-from estimator.straight import straight
 
 
-@straight
+@scalar_jit
 def capped_error(ratio):
     """Relative error of an estimate, at most 1, from its ratio to the truth."""
     deviation = abs(ratio - 1.0)
     return deviation if deviation < 1.0 else 1.0
 
 
-_COMPILED_NAMES = {**NAMES, "capped": capped_error}
+_COMPILED_NAMES = {**RUNTIME_FUNCTIONS, "capped": capped_error}
 
 #: Bounds of a determinant that has a logarithm: below, numbers lose digits.
 _MIN_DETERMINANT, _MAX_DETERMINANT = 2.0**-1000, 2.0**1000
@@ -42,23 +42,25 @@ _MIN_DETERMINANT, _MAX_DETERMINANT = 2.0**-1000, 2.0**1000
 def generated_functions(spec: KernelSpec) -> Any:
     """The compiled functions of a kind of experiment: see `_environment_source` for their names."""
     digests = (spec.belief_model.digest, spec.plant_model and spec.plant_model.digest)
-    key = source_digest(sources_of(__file__)) + repr((spec[2:], digests))
-    return stored.load(spec.belief_model.name, "environment", key, lambda: _environment_source(spec), _COMPILED_NAMES)
+    key = source_digest(source_folders(__file__)) + repr((spec[2:], digests))
+    return stored.load_generated(
+        spec.belief_model.name, "environment", key, lambda: _environment_source(spec), _COMPILED_NAMES
+    )
 
 
 def _environment_source(spec: KernelSpec) -> str:
     """All functions; each says what it does."""
-    from estimator.engine.emit import lane_loop
+    from estimator.engine.printer_numba import print_lane_loop
 
     row_of = block_layout(spec)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str, one: bool = False) -> str:
-        return lane_loop(name, lines, results, row_of, LANES, uniform, doc=doc, one=one)
+        return print_lane_loop(name, lines, results, row_of, LANES, uniform, doc=doc, single_lane=one)
 
     def plant_loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
         noises = {name: row_of[row] for name, row in noise_std_rows(spec.truth_model).items()}
         plant_rows = {**row_of, **model_input_rows(spec, spec.truth_model, row_of), **noises}
-        return lane_loop(name, lines, results, plant_rows, LANES, uniform, doc=doc)
+        return print_lane_loop(name, lines, results, plant_rows, LANES, uniform, doc=doc)
 
     source = _true_coefficients_source(spec, loop) + _step_outcome_source(spec, loop) + _observation_source(spec)
     if spec.plant_model is not None:
@@ -69,14 +71,14 @@ def _environment_source(spec: KernelSpec) -> str:
 
 def _random_walk_source(model: Model, loop: Any) -> str:
     """``walk(W, variances)``: let the coefficients walk at random before a sample."""
-    from estimator.engine.derive import symbol
+    from estimator.engine.symbolic import symbol
 
     names = list(model.coefficients)
     lines = [(f"V_{c}", symbol(f"P_{c}_{c}") + symbol(f"WALK_{c}")) for c in names]
     results = {f"P_{c}_{c}": f"V_{c}" for c in names}
     source = loop("walk_lanes", "The coefficients walk.", lines, results, *(f"WALK_{c}" for c in names))
     arguments = ", ".join(f"variances[{i}]" for i in range(len(names)))
-    return source + f"@straight\ndef walk(W, variances):\n    walk_lanes(W, {arguments})\n"
+    return source + f"@scalar_jit\ndef walk(W, variances):\n    walk_lanes(W, {arguments})\n"
 
 
 def _plant_source(model: Model, degree: int, loop: Any) -> str:
@@ -84,11 +86,11 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
 
     A difference equation shows its first sensor as well; other sensors are ``sense_<k>``.
     """
-    from estimator.engine import derive
+    from estimator.engine import symbolic
 
     names = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
-    lines, results = derive.state_step(model, degree, names)
-    derivatives, symbol = derive.calculus(model), derive.symbol
+    lines, results = symbolic.propagate_state(model, degree, names)
+    derivatives, symbol = symbolic.differentiate(model), symbolic.symbol
     noises = list(noise_std_rows(model))
     strength, w, v = symbol(noises[0]), symbol("NOISE_w"), symbol("NOISE_v")
     after: dict[str, Any] = {}
@@ -98,21 +100,21 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
             # The increment of the noise over a step of length h, and where it reaches a state only through others, its
             # integral; of white noise the two are drawn jointly.
             h = symbol("length")
-            through = sum(derivatives.by[a][k] * strength * derivatives.noise[k] for k in range(model.n_states))
+            through = sum(derivatives.jacobian[a][k] * strength * derivatives.noise[k] for k in range(model.n_states))
             direct, integral = h * w, h * h / 2 * w
             if not model.held:
                 direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
             kick = strength * derivatives.noise[a] * direct if derivatives.noise[a] != 0 else through * integral
-        kick = derive.renamed([("", kick)], names)[0][1]
+        kick = symbolic.substitute([("", kick)], names)[0][1]
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
         after[x] = symbol(f"K_{x}")
     results = {names[x]: f"K_{x}" for x in model.states}
-    end = derive.input_at_end(model, degree)
+    end = symbolic.input_at_end(model, degree)
     source = ""
     for k, (y, output_expression) in enumerate(zip(model.outputs, derivatives.outputs, strict=True)):
         noise = (v, w)[k % 2] * symbol(noises[1 + k])
         state_rows = names if model.is_continuous or k else {**names, **after}
-        value = derive.renamed([("", output_expression)], {**state_rows, "u": end})[0][1] + noise
+        value = symbolic.substitute([("", output_expression)], {**state_rows, "u": end})[0][1] + noise
         if model.is_continuous or k:
             source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
         else:
@@ -127,23 +129,23 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
 
     And what estimates are multiplied by to be compared with its parameters: every sample would divide otherwise.
     """
-    from estimator.engine import derive
+    from estimator.engine import symbolic
 
-    parameter_symbols = {p: derive.symbol(p) for p in parameter_names(spec.truth_model)}
+    parameter_symbols = {p: symbolic.symbol(p) for p in parameter_names(spec.truth_model)}
     lines, results = [], {}
     # Each equation on its own: a plant's coefficients must not depend on what else is believed, to the last bit.
     for tag, model in zip("WX", {spec.truth_model: None, spec.belief_model: None}, strict=False):
         coefficient_values = {}
         for c in model.coefficients:
             text = model.inverse[c] if model.inverse else c
-            value = derive.parse(text, {**parameter_symbols, "step": derive.symbol("step")}, model.name)
-            coefficient_values[f"V_{c}"] = derive.renamed([("", value)], {p: f"PARAM_{p}" for p in parameter_symbols})[
-                0
-            ][1]
+            value = symbolic.parse_expression(text, {**parameter_symbols, "step": symbolic.symbol("step")}, model.name)
+            coefficient_values[f"V_{c}"] = symbolic.substitute(
+                [("", value)], {p: f"PARAM_{p}" for p in parameter_symbols}
+            )[0][1]
             results[f"TRUE_{c}"] = f"V_{c}"
-        lines += derive.shared(coefficient_values, tag)
+        lines += symbolic.eliminate_common_subexpressions(coefficient_values, tag)
     for p in estimated_expressions(spec.belief_model):
-        lines.append((f"V_PER_{p}", 1 / derive.symbol(f"PARAM_{p}")))
+        lines.append((f"V_PER_{p}", 1 / symbolic.symbol(f"PARAM_{p}")))
         results[f"PER_{p}"] = f"V_PER_{p}"
     return loop("settle_truth", "The true coefficients, of the parameters.", lines, results, "step", one=True)
 
@@ -168,20 +170,20 @@ def log_det_and_density(
     """
     import sympy as sp
 
-    from estimator.engine.derive import pair, symbol
-    from estimator.engine.factor import factorise
+    from estimator.engine.ldl import ldl_factorise
+    from estimator.engine.symbolic import symbol, symmetric_entry
 
     names = list(model.coefficients)
-    covariance_symbol = lambda i, k: pair("P", names[k], names[i], model.names)  # noqa: E731
+    covariance_symbol = lambda i, k: symmetric_entry("P", names[k], names[i], model.names)  # noqa: E731
     covariance = {(i, k): covariance_symbol(i, k) for i in range(len(names)) for k in range(i + 1)}
-    factors = factorise(
+    factors = ldl_factorise(
         {place: (covariance_entries or {}).get(str(e), e) for place, e in covariance.items()}, len(names), prefix
     )
     lines, square = [*factors.lines], sp.S.Zero
     whitened: list[Any] = []
     for i, name in enumerate(names if deviations else ()):
         assert deviations is not None
-        lines.append((f"{prefix}Z_{i}", deviations[name] - sum(factors.below[i, m] * whitened[m] for m in range(i))))
+        lines.append((f"{prefix}Z_{i}", deviations[name] - sum(factors.lower[i, m] * whitened[m] for m in range(i))))
         whitened.append(symbol(f"{prefix}Z_{i}"))
         square += whitened[i] ** 2 * factors.inverse[i]
     determinant = symbol(f"{prefix}DET")
@@ -196,9 +198,9 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` and ``NEW_ERROR`` beside the truth; and soundness."""
     import sympy as sp
 
-    from estimator.engine import derive
+    from estimator.engine import symbolic
 
-    symbol, model = derive.symbol, spec.belief_model
+    symbol, model = symbolic.symbol, spec.belief_model
     deviations = {c: symbol(f"TRUE_{c}") - symbol(c) for c in model.coefficients}
     lines, determinant, square, is_sound = log_det_and_density(model, deviations)
     lines.append(("NEW_LOG_DET", sp.Function("log")(determinant)))
@@ -206,10 +208,10 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     coefficient_symbols = {c: symbol(c) for c in model.coefficients} | {"step": symbol("step")}
     capped_error_symbol = sp.Function("capped")
     ratios = {
-        f"RATIO_{p}": derive.parse(text, coefficient_symbols, model.name) * symbol(f"PER_{p}")
+        f"RATIO_{p}": symbolic.parse_expression(text, coefficient_symbols, model.name) * symbol(f"PER_{p}")
         for p, text in estimated_expressions(model).items()
     }
-    lines += derive.shared(ratios, "RW")
+    lines += symbolic.eliminate_common_subexpressions(ratios, "RW")
     lines.append(("NEW_ERROR", sum(capped_error_symbol(symbol(r)) for r in ratios) / len(ratios)))
     return lines, is_sound
 
@@ -218,7 +220,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     """``appraise(W, j, step)`` for a new belief or truth, and ``settle(W, ...)``, what a step gave and what it ends."""
     import sympy as sp
 
-    from estimator.engine.derive import symbol
+    from estimator.engine.symbolic import symbol
 
     model = spec.belief_model
     lines, is_sound = _belief_beside_truth(spec)
@@ -226,7 +228,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     source = loop("appraise", "Measure lane j's belief beside its truth.", lines, result_rows, "step", one=True)
     select, is_positive, is_finite = (sp.Function(name) for name in ("select", "positive", "finite"))
     variances = {f"P_{name}_{name}" for name in model.names}
-    checked_rows = [name for name in belief_names(model) if not name.startswith("P_") or name in variances]
+    checked_rows = [name for name in belief_rows(model) if not name.startswith("P_") or name in variances]
     checked_rows += [f"X_{x}" for x in spec.truth_model.states] + [f"Y_{y}" for y in model.outputs]
     total = sum(
         (symbol(name) for name in checked_rows), symbol("NEW_LOG_DENSITY") + symbol("NEW_ERROR") + symbol("WORK")
@@ -234,7 +236,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     spreads = [symbol(f"P_{x}_{x}") for x in model.states] if spec.factorisation == "structured" else []
     lines.append(("TOTAL", total))
     is_valid = is_sound * is_finite(symbol("TOTAL")) * sp.Mul(*(is_positive(s + sp.Float(1e-300)) for s in spreads))
-    is_valid *= sp.Mul(*(is_positive(symbol(name)) for name in belief_names(model)[-2 - 2 * model.n_outputs :]))
+    is_valid *= sp.Mul(*(is_positive(symbol(name)) for name in belief_rows(model)[-2 - 2 * model.n_outputs :]))
     is_off_record = symbol("OFF_RECORD")
     lines += [("SOUND", is_valid), ("BROKEN", 1 - symbol("SOUND")), ("VOID", symbol("BROKEN") + is_off_record)]
     for name in ("LOG_DET", "LOG_DENSITY", "ERROR"):
@@ -267,8 +269,8 @@ def _observation_source(spec: KernelSpec) -> str:
     """``observe(W, B, ...)``: the observation into the rows of a block ``B``; its prior is told entry by entry."""
     import sympy as sp
 
-    from estimator.engine.derive import pair, symbol
-    from estimator.engine.emit import lane_loop
+    from estimator.engine.printer_numba import print_lane_loop
+    from estimator.engine.symbolic import symbol, symmetric_entry
 
     model = spec.belief_model
     coefficients, order = list(model.coefficients), list(model.names)
@@ -280,7 +282,7 @@ def _observation_source(spec: KernelSpec) -> str:
     for c in coefficients:
         entries[f"log_std_{c}"] = log(symbol(f"P_{c}_{c}") * symbol(f"SCALE_{c}") ** 2) / 2
     for c, d in combinations(coefficients, 2):
-        entries[f"corr_{c}_{d}"] = pair("P", c, d, order) * symbol(f"I_STD_{c}") * symbol(f"I_STD_{d}")
+        entries[f"corr_{c}_{d}"] = symmetric_entry("P", c, d, order) * symbol(f"I_STD_{c}") * symbol(f"I_STD_{d}")
     entries["log_gamma"] = log(symbol("GAMMA_SHAPE") / symbol("GAMMA_RATE")) - symbol("LOG_gamma")
     for y in model.outputs:
         entries[f"log_xi_{y}"] = log(symbol(f"XI_SHAPE_{y}") / symbol(f"XI_RATE_{y}")) - symbol(f"LOG_xi_{y}")
@@ -301,13 +303,13 @@ def _observation_source(spec: KernelSpec) -> str:
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
     scales = ["per_output", "per_input", "horizon", "per_horizon", "budget"]
     rows = {f"OBS_{name}": row for row, name in enumerate(entries)}
-    source = lane_loop(
+    source = print_lane_loop(
         "observe_lanes", lines, {f"OBS_{name}": f"V_{name}" for name in entries}, block_layout(spec), LANES,
-        (*uniform, *scales), doc="The observation, in rows.", beside=rows,
+        (*uniform, *scales), doc="The observation, in rows.", shared_rows=rows,
     )  # fmt: skip
     n, k = model.n_states, model.n_coefficients
     prior_arguments = [*(f"prior[{n + i}]" for i in range(k)), *(f"inverse_std[{i}]" for i in range(k))]
     prior_arguments += [f"log_precisions[{i}]" for i in range(1 + model.n_outputs)]
     arguments = ", ".join(["W", "B", *prior_arguments, *scales])
     signature = ", ".join(["W", "B", "prior", "inverse_std", "log_precisions", *scales])
-    return source + f"@straight\ndef observe({signature}):\n    observe_lanes({arguments})\n"
+    return source + f"@scalar_jit\ndef observe({signature}):\n    observe_lanes({arguments})\n"

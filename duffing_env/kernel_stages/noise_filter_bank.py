@@ -1,6 +1,6 @@
 """Hypotheses about the noises in an environment: several beliefs learn side by side, and the mixture is what is seen.
 
-Their priors and their weights are those of `estimator.ensemble`. A *member* is one of these beliefs. Those of a
+Their priors and their weights are those of `estimator.inference.noise_grid`. A *member* is one of these beliefs. Those of a
 block's environments lie in ``ceil(M n / LANES)`` blocks of their own, of M hypotheses and n environments `interleaved_envs`:
 member m of environment j in lane m n + j. So what is done member by member is done for n environments at once. Only
 what a member goes on from stands there, its record and its weight. The rest of an update is scratch, which stays in the
@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout
-from estimator.arrays import copy_lanes
-from estimator.engine.free_energy import free_energies
-from estimator.engine.rows import belief_names, input_rows
-from estimator.engine.tasks import structured
-from estimator.inference.mixture import mixing, switch, weigh
-from estimator.lanes import LANES, part
+from estimator.compilation.array_operations import copy_range
+from estimator.compilation.simd import LANES, jit_closure
+from estimator.engine.kernels import compile_belief_update
+from estimator.engine.storage_layout import belief_rows, input_rows
+from estimator.engine.variational_free_energy import compile_free_energies
+from estimator.inference.noise_mixture import apply_switching, compile_mixture, reweight
 
 
 def interleave_width(n_envs: int) -> int:
@@ -55,9 +55,11 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
     """Compile them for a kind of experiment."""
     row_of, model = block_layout(spec), spec.belief_model
     expectations = "sigma_points" if spec.uses_cubature else "first_order"
-    task = structured(model, spec.degree, iterations=spec.iterations, trace=True, expectations=expectations)
-    update, member_rows, record_size = task.update, task.layout, len(belief_names(model))
-    mix = mixing(len(model.names)).mix
+    task = compile_belief_update(
+        model, spec.degree, iterations=spec.iterations, keep_trace=True, expectations=expectations
+    )
+    update, member_rows, record_size = task.update, task.layout, len(belief_rows(model))
+    mix = compile_mixture(len(model.names)).mix
     observed_names = [*input_rows(model, spec.degree), *(f"Y_{sensor}" for sensor in model.outputs)]
     copied_rows = tuple((member_rows[row] * LANES, row_of[row] * LANES) for row in observed_names)
     variance_rows = tuple(member_rows[f"P_{c}_{c}"] * LANES for c in model.coefficients)
@@ -67,8 +69,8 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         row_of.get("FREE_ENERGY", -1) * LANES,
     )
     unsound_row = member_rows.get("UNSOUND", -1) * LANES
-    free_energies_of = free_energies(model, spec.iterations, LANES, member_rows, every=False)
-    compile_inner = part(spec.name)
+    free_energies_of = compile_free_energies(model, spec.iterations, LANES, member_rows, every_iteration=False)
+    compile_inner = jit_closure(spec.name)
 
     @compile_inner
     def reset_members(members, env_index, params):
@@ -85,10 +87,10 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
     @compile_inner
     def update_block(U, V, W, n, params, energies_found):
         """Update the members in a block U, by way of a whole block V; ``energies_found`` receives their free energies."""
-        copy_lanes(V, 0, U, 0, weight_row)
+        copy_range(V, 0, U, 0, weight_row)
         for to, source in copied_rows:
             for lane in range(0, LANES, n):
-                copy_lanes(V, to + lane, W, source, n)
+                copy_range(V, to + lane, W, source, n)
         for c in range(len(variance_rows) if params.has_drift else 0):
             for j in range(LANES):
                 V[variance_rows[c] + j] += params.walk_variances[c]
@@ -98,7 +100,7 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         free_energies_of(V, energies_found)
         for j in range(LANES if unsound_row >= 0 else 0):
             energies_found[j] = np.nan if V[unsound_row + j] > 0.0 else energies_found[j]
-        copy_lanes(U, 0, V, 0, weight_row)
+        copy_range(U, 0, V, 0, weight_row)
 
     @compile_inner
     def update_members(W, members, block, params):
@@ -109,14 +111,14 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         for b in range(stop):
             update_block(members[first + b], V, W, n, params, energies_found[b * LANES : (b + 1) * LANES])
         for m in range(0, count * n, n):
-            copy_lanes(weights, m, members[first + m // LANES], weight_row + m % LANES, n)
+            copy_range(weights, m, members[first + m // LANES], weight_row + m % LANES, n)
         member_weights, member_energies = weights.reshape((count, n)), energies_found[: count * n].reshape((count, n))
-        switch(member_weights, member_energies)
-        weigh(member_weights, member_energies, energies)
+        apply_switching(member_weights, member_energies)
+        reweight(member_weights, member_energies, energies)
         for m in range(0, count * n, n):
-            copy_lanes(members[first + m // LANES], weight_row + m % LANES, weights, m, n)
+            copy_range(members[first + m // LANES], weight_row + m % LANES, weights, m, n)
         mix(members, first, member_weights, normalised_weights, W, LANES)
         if free_energy_row >= 0:
-            copy_lanes(W, free_energy_row, energies, 0, n)
+            copy_range(W, free_energy_row, energies, 0, n)
 
     return FilterBank(reset_members, update_members)

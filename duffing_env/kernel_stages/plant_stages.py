@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_uniform, word_to_float
-from estimator.lanes import LANES, jit, lanewise
+from estimator.compilation.simd import LANES, jit, lanewise
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 # A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).

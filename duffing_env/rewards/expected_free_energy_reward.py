@@ -16,13 +16,13 @@ from typing import Any
 
 from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
 from duffing_env.storage.kernel_spec import KernelSpec
-from estimator.engine.rows import carried_names
-from estimator.lanes import part
+from estimator.compilation.simd import jit_closure
+from estimator.engine.storage_layout import integrator_rows
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
     """``expect_sample(W)``: an imagined sample at the belief."""
-    from estimator.engine.derive import symbol
+    from estimator.engine.symbolic import symbol
 
     # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
     noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
@@ -51,29 +51,29 @@ def expected_sample_source(
     import sympy as sp
 
     from duffing_env.kernel_stages.env_codegen import log_det_and_density
-    from estimator.engine import algebra, derive, sensitivity
+    from estimator.engine import gaussian_update, symbolic, variational_rk4
 
     model, source, body = spec.belief_model, "", ""
-    lines, motion = derive.moved(model)
+    lines, motion = symbolic.propagate_sample(model)
     if model.is_continuous:
-        carried = carried_names(model)
-        start = [(f"V_{row}", value) for row, value in derive.carried_at_start(model).items()]
+        carried = integrator_rows(model)
+        start = [(f"V_{row}", value) for row, value in symbolic.integrator_start(model).items()]
         source += loop(
             f"{name}_begin",
             "The point that moves.",
-            derive.renamed(start, substitutions),
+            symbolic.substitute(start, substitutions),
             {row: f"V_{row}" for row in carried},
         )
-        step = derive.renamed(sensitivity.motion_step(model, spec.degree), substitutions)
+        step = symbolic.substitute(variational_rk4.variational_rk4_step(model, spec.degree), substitutions)
         source += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
         steps = model.substeps
         body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"
-    update_lines, results = algebra.expected_sample(model, motion, spec.degree)
+    update_lines, results = gaussian_update.update_without_data(model, motion, spec.degree)
     log, covariances = sp.Function("log"), [row for row in results if row.startswith("P_")]
     lines_before, det_before, _, _ = log_det_and_density(model, prefix="B")
-    entries = {row: derive.symbol(results[row]) for row in covariances}
+    entries = {row: symbolic.symbol(results[row]) for row in covariances}
     lines_after, det_after, _, _ = log_det_and_density(model, covariance_entries=entries, prefix="A")
-    lines = derive.renamed(
+    lines = symbolic.substitute(
         [
             *first_assignments,
             *lines,
@@ -85,19 +85,19 @@ def expected_sample_source(
         substitutions,
     )
     kept_rows = (
-        {substitutions[row]: str(derive.renamed([("", entries[row])], substitutions)[0][1]) for row in covariances}
+        {substitutions[row]: str(symbolic.substitute([("", entries[row])], substitutions)[0][1]) for row in covariances}
         if keeps_covariance
         else {}
     )
     source += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept_rows, "WORK": "GAINED"})
-    return source + f"@straight\ndef {name}(W):\n{body}    {name}_finish(W)\n"
+    return source + f"@scalar_jit\ndef {name}(W):\n{body}    {name}_finish(W)\n"
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """It expects before the belief is updated."""
     expect_sample = generated.expect
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def before_update(W, params):
         expect_sample(W)
 

@@ -12,17 +12,17 @@ from typing import Any
 from duffing_env.rewards.expected_free_energy_reward import expected_sample_source
 from duffing_env.rewards.reward_registry import RewardHooks, no_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout, noise_std_rows
-from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, part
+from estimator.compilation.simd import LANES, jit_closure
+from estimator.engine.storage_layout import belief_rows
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
     """``update_ideal(W)``: an imagined sample at the truth."""
-    from estimator.engine.derive import symbol
+    from estimator.engine.symbolic import symbol
 
     model = spec.belief_model
     truth_rows = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
-    truth_rows |= {name: f"I_{name}" for name in belief_names(model) if name.startswith("P_")}
+    truth_rows |= {name: f"I_{name}" for name in belief_rows(model) if name.startswith("P_")}
     names, stds = ["Q", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
     noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
     return expected_sample_source("ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
@@ -31,7 +31,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """It starts from the prior, and counts a sample before the plant moves."""
     row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.ideal
-    names = belief_names(model)
+    names = belief_rows(model)
     information_rows = tuple(
         (names.index(name), row_of[f"I_{name}"] * LANES) for name in names if name.startswith("P_")
     )
@@ -39,13 +39,13 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     if model.n_outputs > 1:
         raise ValueError(f"reward 'fisher' is for one sensor, but {model.name!r} has {model.n_outputs}")
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def start_information(W, j, params):
         if W[elapsed_row + j] == 0.0:  # a truth that changes in an episode does not take back what was known
             for index, row in information_rows:
                 W[row + j] = params.prior[index]
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def add_sample_information(W, params):
         update_ideal(W)
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout
-from estimator.arrays import copy
-from estimator.engine.free_energy import free_energies
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import LANES, jit_closure
+from estimator.engine.variational_free_energy import compile_free_energies
 from estimator.inference import mean_field
-from estimator.lanes import LANES, part
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
@@ -23,7 +23,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """It reads what the update leaves."""
     free_energies_of, reward_row = _compile_free_energies(spec), block_layout(spec)["WORK"] * LANES
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def after(W, params):
         energies = np.empty(LANES)
         free_energies_of(W, energies)
@@ -39,18 +39,18 @@ def _compile_free_energies(spec: KernelSpec) -> Any:
     if spec.has_noise_hypotheses:
         free_energy_row = row_of["FREE_ENERGY"] * LANES
 
-        @part(spec.name)
+        @jit_closure(spec.name)
         def mixture_free_energy(W, energies):
             copy(energies, 0, W[free_energy_row:], LANES)
 
         return mixture_free_energy
     if spec.factorisation == "mean_field":
-        free_energy = mean_field.pieces(row_of).free_energy
+        free_energy = mean_field.compile_mean_field(row_of).free_energy
 
-        @part(spec.name)
+        @jit_closure(spec.name)
         def mean_field_free_energy(W, energies):
             for j in range(LANES):
                 energies[j] = free_energy(W, j)
 
         return mean_field_free_energy
-    return free_energies(spec.belief_model, spec.iterations, LANES, row_of, every=False)
+    return compile_free_energies(spec.belief_model, spec.iterations, LANES, row_of, every_iteration=False)

@@ -59,7 +59,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from estimator.lanes import jit
+from estimator.compilation.simd import jit
 from estimator.support.argument_checks import did_you_mean
 
 

@@ -19,10 +19,10 @@ import numpy as np
 
 from duffing_env.rewards.reward_registry import RewardHooks, no_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout
-from estimator.arrays import copy_lanes
-from estimator.engine.feeding import feeder
-from estimator.engine.rows import input_rows
-from estimator.lanes import LANES, part
+from estimator.compilation.array_operations import copy_range
+from estimator.compilation.simd import LANES, jit_closure
+from estimator.engine.input_hold import compile_input_writer
+from estimator.engine.storage_layout import input_rows
 from estimator.support.array_types import FloatArray
 
 #: Length of the test input: 105 ms.
@@ -47,18 +47,20 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     """``step_believed`` and ``step_true``: the believed and the true plant; ``add_difference`` adds up, ``finish_misfit`` ends."""
     import sympy as sp
 
-    from estimator.engine.derive import calculus, renamed, state_step, symbol
+    from estimator.engine.symbolic import differentiate, propagate_state, substitute, symbol
 
     model = spec.belief_model
     believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
     true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
     substep_arguments = ("T",) if model.is_continuous else ()
     source_text = loop(
-        "model_move", "The believed plant moves.", *state_step(model, spec.degree, believed), *substep_arguments
+        "model_move", "The believed plant moves.", *propagate_state(model, spec.degree, believed), *substep_arguments
     )
-    source_text += loop("twin_move", "The true plant moves.", *state_step(model, spec.degree, true), *substep_arguments)
-    output_expression = calculus(model).outputs[0].subs(symbol("u"), 0)
-    believed_output, true_output = (renamed([("", output_expression)], names)[0][1] for names in (believed, true))
+    source_text += loop(
+        "twin_move", "The true plant moves.", *propagate_state(model, spec.degree, true), *substep_arguments
+    )
+    output_expression = differentiate(model).outputs[0].subs(symbol("u"), 0)
+    believed_output, true_output = (substitute([("", output_expression)], names)[0][1] for names in (believed, true))
     lines = [
         ("E_d", symbol("DEVIATION") + (believed_output - true_output) ** 2),
         ("E_p", symbol("POWER") + true_output**2),
@@ -76,7 +78,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     row_of, model = block_layout(spec), spec.belief_model
     first, last = row_of[f"MODEL_{next(iter(model.states))}"] * LANES, (row_of["POWER"] + 1) * LANES
     rows = [row_of[row] for row in input_rows(model, spec.degree)]
-    inputs, feed_input = tuple(row * LANES for row in rows), feeder(model, spec.degree, rows, LANES)
+    inputs, feed_input = tuple(row * LANES for row in rows), compile_input_writer(model, spec.degree, rows, LANES)
     reward_row, misfit_row = row_of["WORK"] * LANES, row_of["MISFIT"] * LANES
     step_believed, step_true, add_difference, finish_misfit = (
         generated.model_move,
@@ -86,12 +88,12 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     )
     substeps, is_continuous = model.substeps, model.is_continuous
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def run_free_simulation(W, max_input):
         """The misfits of a block's beliefs."""
         saved_inputs = np.empty(len(inputs) * LANES)
         for k in range(len(inputs)):
-            copy_lanes(saved_inputs, k * LANES, W, inputs[k], LANES)
+            copy_range(saved_inputs, k * LANES, W, inputs[k], LANES)
         for i in range(first, last):
             W[i] = 0.0
         for t in range(TEST_SAMPLES):
@@ -110,20 +112,20 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
             add_difference(W)
         finish_misfit(W)
         for k in range(len(inputs)):
-            copy_lanes(W, inputs[k], saved_inputs, k * LANES, LANES)
+            copy_range(W, inputs[k], saved_inputs, k * LANES, LANES)
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def start_simulation_error(W, j, params):
         """Of lane j alone: the other lanes keep what they had."""
         saved_rewards, saved_misfits = np.empty(LANES), np.empty(LANES)
-        copy_lanes(saved_rewards, 0, W, reward_row, LANES)
-        copy_lanes(saved_misfits, 0, W, misfit_row, LANES)
+        copy_range(saved_rewards, 0, W, reward_row, LANES)
+        copy_range(saved_misfits, 0, W, misfit_row, LANES)
         run_free_simulation(W, params.max_input)
         saved_misfits[j] = W[misfit_row + j]
-        copy_lanes(W, reward_row, saved_rewards, 0, LANES)
-        copy_lanes(W, misfit_row, saved_misfits, 0, LANES)
+        copy_range(W, reward_row, saved_rewards, 0, LANES)
+        copy_range(W, misfit_row, saved_misfits, 0, LANES)
 
-    @part(spec.name)
+    @jit_closure(spec.name)
     def update_simulation_error(W, params):
         run_free_simulation(W, params.max_input)
 

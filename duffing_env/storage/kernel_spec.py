@@ -1,7 +1,7 @@
 """What an experiment is compiled for, the rows of its block, and what its kernel is told.
 
-Environments lie in blocks of `estimator.lanes.LANES`. A block holds the rows of the estimator first
-(`estimator.engine.rows.layout`), then those of the plant and of the episode.
+Environments lie in blocks of `estimator.compilation.simd.LANES`. A block holds the rows of the estimator first
+(`estimator.engine.storage_layout.update_layout`), then those of the plant and of the episode.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from estimator.engine.rows import belief_names, carried_names, layout, trace_names
-from estimator.lanes import part, rows
+from estimator.compilation.simd import jit_closure, number_rows
+from estimator.engine.storage_layout import belief_rows, integrator_rows, trace_rows, update_layout
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 
@@ -56,7 +56,7 @@ class KernelSpec(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What tells its compiled functions from those of other kinds (`estimator.lanes.part`)."""
+        """What tells its compiled functions from those of other kinds (`estimator.compilation.simd.jit_closure`)."""
         digests = (self.belief_model.digest, self.plant_model.digest if self.plant_model else "replay")
         return "_".join(str(word) for word in (*digests, *self[2:]))
 
@@ -150,7 +150,7 @@ def compile_unpacker(spec: KernelSpec) -> Any:
         "reward_weights": 4,
     }
     sizes |= dict.fromkeys(("walk_variances", "prior_inverse_std"), spec.belief_model.n_coefficients)
-    sizes |= {"prior": len(belief_names(spec.belief_model)), "prior_log_precisions": 1 + spec.belief_model.n_outputs}
+    sizes |= {"prior": len(belief_rows(spec.belief_model)), "prior_log_precisions": 1 + spec.belief_model.n_outputs}
     fields, offset = [], 0
     for name, field_type in get_type_hints(KernelParams).items():
         size = sizes.get(name)
@@ -166,7 +166,7 @@ def compile_unpacker(spec: KernelSpec) -> Any:
 def _compiled_unpacker(arguments: str) -> Any:
     namespace: dict[str, Any] = {"Setup": KernelParams}
     exec(f"def unpack(packed):\n    return Setup({arguments})\n", namespace)
-    return part(hashlib.sha256(arguments.encode()).hexdigest()[:12])(namespace["unpack"])
+    return jit_closure(hashlib.sha256(arguments.encode()).hexdigest()[:12])(namespace["unpack"])
 
 
 def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
@@ -212,7 +212,7 @@ def estimated_expressions(model: Model) -> Mapping[str, str]:
 def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of this kind."""
     belief, truth = spec.belief_model, spec.truth_model
-    row_of = {name: row for name, row in layout(belief, spec.degree).items() if not name.startswith("U_")}
+    row_of = {name: row for name, row in update_layout(belief, spec.degree).items() if not name.startswith("U_")}
     row_of = {name: row for row, name in enumerate(row_of)}
     row_names = [f"Y_{y}" for y in truth.outputs]
     row_names += [f"PARAM_{p}" for p in parameter_names(truth)]
@@ -225,19 +225,19 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     row_names += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
     row_names += OUTCOME_ROWS
     if spec.reward_hooks == "fisher":
-        row_names += [f"I_{name}" for name in belief_names(belief) if name.startswith("P_")]
+        row_names += [f"I_{name}" for name in belief_rows(belief) if name.startswith("P_")]
     if spec.reward_hooks == "simulation_error":
         row_names += [f"{who}_{x}" for who in ("MODEL", "TWIN") for x in belief.states]
         row_names += ["DEVIATION", "POWER", "MISFIT"]
     if spec.factorisation == "mean_field":
         from estimator.inference import mean_field
 
-        row_names += [*mean_field.SCRATCH, *missing_mean_field_rows(spec)]
-    row_names += [name for name in carried_names(belief) if name not in row_of]
+        row_names += [*mean_field.SCRATCH_ROWS, *missing_mean_field_rows(spec)]
+    row_names += [name for name in integrator_rows(belief) if name not in row_of]
     if spec.reward_hooks == "free_energy" and spec.factorisation == "structured":
-        row_names += ["FREE_ENERGY"] if spec.has_noise_hypotheses else trace_names(belief, spec.iterations)
+        row_names += ["FREE_ENERGY"] if spec.has_noise_hypotheses else trace_rows(belief, spec.iterations)
     missing = [name for name in dict.fromkeys(row_names) if name not in row_of]
-    row_of |= rows(" ".join(missing), start=len(row_of))
+    row_of |= number_rows(" ".join(missing), first_row=len(row_of))
     return row_of | model_input_rows(spec, belief, row_of)
 
 
@@ -245,8 +245,8 @@ def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
     """Rows of what the paper's model has and the believed one has not, which mean field needs: they hold zeros."""
     if spec.factorisation != "mean_field":
         return []
-    believed_rows = belief_names(spec.belief_model)
-    return [name for name in belief_names(difference()) if name not in believed_rows]
+    believed_rows = belief_rows(spec.belief_model)
+    return [name for name in belief_rows(difference()) if name not in believed_rows]
 
 
 def model_input_rows(spec: KernelSpec, model: Model, row_of: Mapping[str, int]) -> dict[str, int]:

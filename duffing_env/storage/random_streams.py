@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from estimator.elementary import log
-from estimator.straight import straight
+from estimator.compilation.elementary_functions import log
+from estimator.compilation.scalar_jit import scalar_jit
 
 _S3, _S11, _S12, _S24, _S40 = (np.uint64(n) for n in (3, 11, 12, 24, 40))
 _COUNTER_STEP = np.uint64(1)
@@ -29,32 +29,32 @@ def new_stream_words(generator: np.random.Generator, branch: str = "train") -> n
     return words.view(np.float64)
 
 
-@straight
+@scalar_jit
 def float_to_word(bits):
     """The 64-bit word that a float64 row holds."""
     return np.float64(bits).view(np.uint64)
 
 
-@straight
+@scalar_jit
 def word_to_float(word):
     """A 64-bit word as the bits of a float64, to lie in a row."""
     return np.uint64(word).view(np.float64)
 
 
-@straight
+@scalar_jit
 def sfc64_next(a, b, c, counter):
     """One 64-bit draw of SFC64: the value and the next four words."""
     value = a + b + counter
     return value, b ^ (b >> _S11), c + (c << _S3), ((c << _S24) | (c >> _S40)) + value, counter + _COUNTER_STEP
 
 
-@straight
+@scalar_jit
 def to_uniform(value):
     """A uniform number in (0, 1) from a draw: the middle of one of 2^52 equal intervals."""
     return (np.float64(np.int64(value >> _S12)) + 0.5) * _UNIT_52
 
 
-@straight
+@scalar_jit
 def box_muller(uniform_1, uniform_2):
     """Two independent standard normal numbers from two uniform ones (Box and Muller 1958)."""
     radius = np.sqrt(-2.0 * log(uniform_1))

@@ -14,7 +14,7 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.tracks.rig_plant_env import ONE_PLANT_MESSAGE, Plant, RigLike, RigPlantEnv, RigScaling, playable_rig
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
-from estimator.ensemble import Hypotheses
+from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.model import Model
 from estimator.rigs.rig_prior import NOISE_STD_FRACTION, OFFSET_STD_FRACTION, STDS_PER_90_PERCENT, rig_prior
 from estimator.support.array_types import FloatArray
@@ -34,7 +34,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
     process_noise: float | None = None  # type: ignore[assignment]
     measurement_noise: float | None = None  # type: ignore[assignment]
     noise_range: float = 10.0
-    noise_hypotheses: Hypotheses = (5, 5)
+    noise_hypotheses: NoiseGridSize = (5, 5)
 
     def __post_init__(self) -> None:
         if not isinstance(self.factorisation, str) or self.factorisation != "structured":
@@ -105,7 +105,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
         """
         if model != self.model:
             raise ValueError(f"model must be the rig's, but is {model.name!r}")
-        return self.prior_belief.factorised(factorisation)
+        return self.prior_belief.with_factorisation(factorisation)
 
     @property
     def plant_params(self) -> dict[str, Any]:

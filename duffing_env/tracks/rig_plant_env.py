@@ -18,7 +18,7 @@ from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment_config import MAX_SAMPLES, Experiment, check_prior
 from duffing_env.rewards.reward_registry import kernel_reward
 from estimator.belief import Belief
-from estimator.ensemble import Hypotheses
+from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import equal_effect_log_ratio, reset_state, rig_prior
@@ -133,7 +133,7 @@ class RigPlantExperiment(RigScaling, Experiment):
     max_output: float = 1.0
     horizon: int = 256
     prior: Belief | None = None
-    noise_hypotheses: Hypotheses = (7, 7)
+    noise_hypotheses: NoiseGridSize = (7, 7)
 
     knows_truth: ClassVar[bool] = False
 

@@ -81,7 +81,7 @@ class ReplayExperiment(Experiment):
     @cached_property
     def prior_belief(self) -> Belief:
         """The prior of that name."""
-        return _PRIOR_FACTORIES[self.prior](self.model).factorised(self.factorisation)
+        return _PRIOR_FACTORIES[self.prior](self.model).with_factorisation(self.factorisation)
 
     @property
     def replayed_record(self) -> tuple[FloatArray, FloatArray]:

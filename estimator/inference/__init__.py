@@ -4,7 +4,7 @@
 DEFAULT_ITERATIONS = {"structured": 3, "mean_field": 10}
 
 #: More iterations per sample change nothing that shows.
-MOST_ITERATIONS = 100
+MAX_ITERATIONS = 100
 
 #: How a step may move a Gaussian belief.
 EXPECTATIONS = ("first_order", "sigma_points")

@@ -15,39 +15,39 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from estimator.elementary import LOG_2PI, expected_log_gamma, gamma_step_divergence
-from estimator.engine.cache import digest_of
-from estimator.engine.rows import layout as layout_of_update
-from estimator.lanes import LANES, jit, lanewise, of_lane, part, rows
+from estimator.compilation.elementary_functions import LOG_2PI, expected_log_gamma, gamma_update_divergence
+from estimator.compilation.scalar_jit import scalar_jit
+from estimator.compilation.simd import LANES, jit, jit_closure, jit_single_lane, lanewise, number_rows
+from estimator.engine.source_cache import variant_digest
+from estimator.engine.storage_layout import update_layout as layout_of_update
 from estimator.models.difference_equation import difference
-from estimator.straight import straight
 
 #: Precision of the identity x_{t-1} = x_{t-1} between z_t and z_{t-1}: 1/ε of the paper.
-TIE = 1e12
+TIE_PRECISION = 1e12
 
-_COVARIANCES = """
+_COVARIANCE_ROWS = """
     P_theta1_theta1 P_theta1_theta2 P_theta1_theta3 P_theta2_theta2 P_theta2_theta3 P_theta3_theta3 P_eta_eta
 """
 
 #: The prior factors of a sample, which its iterations share.
-_FACTORS = """
+_PRIOR_FACTOR_ROWS = """
     prior_theta1 prior_theta2 prior_theta3 prior_eta
     prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_eta_variance
     prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_gamma_rate prior_xi_rate prior_x1 prior_x2
 """
 
 #: The marginals of z_t = (z0, z1) and of z_{t-1} = (q0, q1), and what the free energy needs.
-_MARGINALS = "z0 z1 z0_variance q0 q1"
-_SPREADS = """
+_MARGINAL_ROWS = "z0 z1 z0_variance q0 q1"
+_MOMENT_ROWS = """
     Q_00 Q_01 Q_11
     eta_information theta_information theta_shift residual_power error_power gamma_increment xi_increment
 """
 
 #: Rows that lie idle but during an update.
-SCRATCH = tuple(f"{_FACTORS} {_MARGINALS} gamma xi {_SPREADS}".split())
+SCRATCH_ROWS = tuple(f"{_PRIOR_FACTOR_ROWS} {_MARGINAL_ROWS} gamma xi {_MOMENT_ROWS}".split())
 
 
-class Pieces(NamedTuple):
+class MeanFieldUpdate(NamedTuple):
     """The update over the rows of a block.
 
     Attributes:
@@ -63,26 +63,26 @@ class Pieces(NamedTuple):
     free_energy: Any
 
 
-def pieces(place: Mapping[str, int], lanes: int = LANES) -> Pieces:
-    """Compile the update for a block of ``lanes`` systems whose rows, and those of `SCRATCH`, stand in ``place``."""
-    return Pieces(
-        lanewise(place, f"{_FACTORS} {_MARGINALS} gamma xi GAMMA_SHAPE XI_SHAPE_y", lanes=lanes)(begin),
+def compile_mean_field(layout: Mapping[str, int], lanes: int = LANES) -> MeanFieldUpdate:
+    """Compile the update for a block of ``lanes`` systems whose rows, and those of `SCRATCH_ROWS`, stand in ``mean_field_layout``."""
+    return MeanFieldUpdate(
+        lanewise(layout, f"{_PRIOR_FACTOR_ROWS} {_MARGINAL_ROWS} gamma xi GAMMA_SHAPE XI_SHAPE_y", lanes=lanes)(begin),
         lanewise(
-            place,
-            f"theta1 theta2 theta3 eta {_COVARIANCES} {_MARGINALS} GAMMA_RATE XI_RATE_y gamma xi {_SPREADS}",
+            layout,
+            f"theta1 theta2 theta3 eta {_COVARIANCE_ROWS} {_MARGINAL_ROWS} GAMMA_RATE XI_RATE_y gamma xi {_MOMENT_ROWS}",
             "as_published",
             lanes,
         )(iterate),
-        lanewise(place, "x1 x2 P_x1_x1 P_x1_x2 P_x2_x2", lanes=lanes)(end),
-        of_lane(place, free_energy, lanes),
+        lanewise(layout, "x1 x2 P_x1_x1 P_x1_x2 P_x2_x2", lanes=lanes)(end),
+        jit_single_lane(layout, free_energy, lanes),
     )
 
 
-def updater(place: Mapping[str, int]) -> Any:
+def compile_mean_field_loop(layout: Mapping[str, int]) -> Any:
     """``update(W, iterations, as_published)``: every lane's belief with its rows ``U_0`` and ``Y_y``."""
-    begin, iterate, end, _ = pieces(place)
+    begin, iterate, end, _ = compile_mean_field(layout)
 
-    @part(digest_of(sorted(place.items())))
+    @jit_closure(variant_digest(sorted(layout.items())))
     def update(W, iterations, as_published):
         begin(W)
         for _ in range(iterations):
@@ -92,10 +92,10 @@ def updater(place: Mapping[str, int]) -> Any:
     return update
 
 
-def layout() -> dict[str, int]:
-    """Rows of a block: those of the paper's model, and `SCRATCH`."""
+def mean_field_layout() -> dict[str, int]:
+    """Rows of a block: those of the paper's model, and `SCRATCH_ROWS`."""
     place = layout_of_update(difference(), 0)
-    return place | rows(" ".join(SCRATCH), start=len(place))
+    return place | number_rows(" ".join(SCRATCH_ROWS), first_row=len(place))
 
 
 def begin(
@@ -164,10 +164,10 @@ def iterate(
     a1 = theta3
     offset = 0.0 if as_published else regression - a0 * q0 - a1 * q1
     pull = gamma * (z0 - eta * u - offset)
-    l00 = prior_L_00 + gamma * a0 * a0 + TIE
+    l00 = prior_L_00 + gamma * a0 * a0 + TIE_PRECISION
     l01 = prior_L_01 + gamma * a0 * a1
     l11 = prior_L_11 + gamma * a1 * a1
-    h0 = prior_h_0 + a0 * pull + TIE * z1
+    h0 = prior_h_0 + a0 * pull + TIE_PRECISION * z1
     h1 = prior_h_1 + a1 * pull
     determinant = l00 * l11 - l01 * l01
     Q_00 = l11 / determinant
@@ -196,7 +196,7 @@ def iterate(
     )  # fmt: skip
 
 
-@straight
+@scalar_jit
 def _residual_power(
     theta1, theta2, theta3, eta, u, z0, z0_variance, q0, q1, Q_00, Q_01, Q_11,
     V_11, V_12, V_13, V_22, V_23, V_33, eta_variance,
@@ -213,7 +213,7 @@ def _residual_power(
 
 def end(z0, z1, z0_variance):
     """Keep q(z_t) as the state belief; the coefficients and noises are in their rows already."""
-    return z0, z1, z0_variance, 0.0, 1.0 / TIE
+    return z0, z1, z0_variance, 0.0, 1.0 / TIE_PRECISION
 
 
 def free_energy(
@@ -238,14 +238,14 @@ def free_energy(
     volumes = (prior_L_00 * prior_L_11 - prior_L_01 * prior_L_01) * (Q_00 * Q_11 - Q_01 * Q_01)
     last_state = 0.5 * (overlap - 2.0 + shift - math.log(volumes))
 
-    noises = gamma_step_divergence(GAMMA_SHAPE - 0.5, prior_gamma_rate, gamma_increment)
-    noises += gamma_step_divergence(XI_SHAPE_y - 0.5, prior_xi_rate, xi_increment)
+    noises = gamma_update_divergence(GAMMA_SHAPE - 0.5, prior_gamma_rate, gamma_increment)
+    noises += gamma_update_divergence(XI_SHAPE_y - 0.5, prior_xi_rate, xi_increment)
 
-    tie_power = (z1 - q0) * (z1 - q0) + 1.0 / TIE + Q_00
-    transition = LOG_2PI + 0.5 * (gamma * residual_power + TIE * tie_power)
-    transition -= 0.5 * (expected_log_gamma(GAMMA_SHAPE, GAMMA_RATE) + math.log(TIE))
+    tie_power = (z1 - q0) * (z1 - q0) + 1.0 / TIE_PRECISION + Q_00
+    transition = LOG_2PI + 0.5 * (gamma * residual_power + TIE_PRECISION * tie_power)
+    transition -= 0.5 * (expected_log_gamma(GAMMA_SHAPE, GAMMA_RATE) + math.log(TIE_PRECISION))
     likelihood = 0.5 * (LOG_2PI - expected_log_gamma(XI_SHAPE_y, XI_RATE_y) + xi * error_power)
-    state_entropy = LOG_2PI + 1.0 + 0.5 * (math.log(z0_variance) - math.log(TIE))
+    state_entropy = LOG_2PI + 1.0 + 0.5 * (math.log(z0_variance) - math.log(TIE_PRECISION))
     return coefficients + last_state + noises + transition + likelihood - state_entropy
 
 

@@ -109,25 +109,25 @@ def _evaluate(function: Any, points: FloatArray, step: float) -> FloatArray:
 @cache
 def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
     """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
-    from estimator.engine import cache as stored
+    from estimator.engine import source_cache as stored
 
     mapped = getattr(model, direction)
     names = list(model.coefficients if direction == "physical" else model.physical)
 
     def make() -> str:
-        from estimator.engine import derive, emit
+        from estimator.engine import printer_numba, symbolic
 
-        known = {name: derive.symbol(name) for name in (*names, "step")}
-        expressions = [derive.parse(text, known, model.name) for text in mapped.values()]
+        known = {name: symbolic.symbol(name) for name in (*names, "step")}
+        expressions = [symbolic.parse_expression(text, known, model.name) for text in mapped.values()]
         slopes = [e.diff(known[name]) for e in expressions for name in names]
         source = ""
         for title, values in (("values", expressions), ("slopes", slopes)):
-            lines = derive.shared({f"V_{i}": e for i, e in enumerate(values)}, "W")
-            body = "".join(f"    {name} = {emit.text_of(e)}\n" for name, e in lines)
+            lines = symbolic.eliminate_common_subexpressions({f"V_{i}": e for i, e in enumerate(values)}, "W")
+            body = "".join(f"    {name} = {printer_numba.print_expression(e)}\n" for name, e in lines)
             gathered = ", ".join(f"V_{i}" for i in range(len(values)))
             source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
         return source
 
     functions = {name: getattr(np, name) for name in GENERATED_FUNCTIONS}
-    code = stored.load(model.name, direction, model.digest, make, functions)
+    code = stored.load_generated(model.name, direction, model.digest, make, functions)
     return code.values, code.slopes

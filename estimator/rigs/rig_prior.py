@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.belief import Belief, covariance_places
+from estimator.belief import Belief, covariance_indices
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.models.model import Model
-from estimator.priors import add_offset, gaussian, moments
+from estimator.priors import add_output_offset, gauss_hermite, quadrature_moments
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
@@ -47,9 +47,9 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
         raise ValueError("rig must have a guess of m, c, a and b, but has none; add one, or use identify on a record")
     scales = rig.scales if scales is None else scales
     axes = {name: _quadrature_axis(name, *rig.guess[name]) for name in rig.guess}
-    axes["u0"] = gaussian(rig.input.offset, OFFSET_STD_FRACTION * scales.input, _OFFSET_NODES)
-    axes["y0"] = gaussian(rig.output.offset, OFFSET_STD_FRACTION * scales.output, _OFFSET_NODES)
-    return belief_from_moments(rig, scales, *moments(rig.model, axes, scales))
+    axes["u0"] = gauss_hermite(rig.input.offset, OFFSET_STD_FRACTION * scales.input, _OFFSET_NODES)
+    axes["y0"] = gauss_hermite(rig.output.offset, OFFSET_STD_FRACTION * scales.output, _OFFSET_NODES)
+    return belief_from_moments(rig, scales, *quadrature_moments(rig.model, axes, scales))
 
 
 def belief_from_moments(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
@@ -75,8 +75,8 @@ def reset_state(belief: Belief) -> Belief:
     order = belief.scales.order
     mean, cov = _with_unknown_state(belief.model, order, belief.coefficients_mean, belief.coefficients_cov)
     record = belief.record.copy()
-    record[: len(mean)], record[covariance_places(belief.model)] = mean, cov
-    return replace(belief, record=record).factorised(belief.factorisation)
+    record[: len(mean)], record[covariance_indices(belief.model)] = mean, cov
+    return replace(belief, record=record).with_factorisation(belief.factorisation)
 
 
 def _with_unknown_state(model: Model, order: int, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -91,7 +91,7 @@ def _with_unknown_state(model: Model, order: int, mean: FloatArray, cov: FloatAr
     joint[:n, :n] = np.diag([displacement**2, (displacement * frequency) ** 2])
     joint[n:, n:] = cov
     if order == 0 and "output_offset" in model.coefficients:
-        add_offset(model, joint_mean, joint)
+        add_output_offset(model, joint_mean, joint)
     return joint_mean, joint
 
 
@@ -124,6 +124,8 @@ def _large_motion_frequency(coefficients: Mapping[str, float]) -> float:
 def _quadrature_axis(name: str, low: float, high: float) -> tuple[FloatArray, FloatArray]:
     """Points and weights of a parameter."""
     if name != "m":
-        return gaussian((low + high) / 2, (high - low) / 2 / STDS_PER_90_PERCENT, _PARAMETER_NODES)
-    points, weights = gaussian(np.log(low * high) / 2, np.log(high / low) / 2 / STDS_PER_90_PERCENT, _PARAMETER_NODES)
+        return gauss_hermite((low + high) / 2, (high - low) / 2 / STDS_PER_90_PERCENT, _PARAMETER_NODES)
+    points, weights = gauss_hermite(
+        np.log(low * high) / 2, np.log(high / low) / 2 / STDS_PER_90_PERCENT, _PARAMETER_NODES
+    )
     return np.exp(points), weights

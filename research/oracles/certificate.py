@@ -41,7 +41,7 @@ import numpy as np
 from agents.cli import JsonOptions, iterate_with_progress, run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import Oracle, TrackSystems
-from estimator.free_run import free_run
+from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from estimator.support.array_types import FloatArray
 from research.oracles.input_mixture import BoundMultipliers, InformationMoments, improve_mixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.lanes import jit, kernel
+from estimator.compilation.simd import jit, kernel
 
 
 @jit

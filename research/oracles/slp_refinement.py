@@ -20,8 +20,8 @@ import numpy as np
 
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality
 from agents.planning.projected_gradient import DesignLimits
-from estimator.arrays import copy, fill
-from estimator.lanes import kernel
+from estimator.compilation.array_operations import copy, fill
+from estimator.compilation.simd import kernel
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 from research.oracles.linear_programme import LinearProgramme
@@ -80,12 +80,12 @@ def _compile_linearisation(model: Model, degree: int) -> tuple[Any, Any]:
         found.input_at,
     )
     begin, coefficients_of, lay, step, back, seed = (
-        code.begin, code.coefficients, code.lay, code.step, code.back, code.seed
+        code.begin, code.coefficients, code.input_coefficients, code.step, code.backward, code.seed_adjoint
     )  # fmt: skip
     n, start_size = model.n_states, found.start_size
     compile_key = f"{model.name}_{model.digest}_{degree}"
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def linearise(nominal, limit, u, found):
         start, workspace = np.zeros(start_size), workspace_for(len(u))
         value, peak = criterion_and_gradient(nominal, limit, 0.0, start, u, workspace)
@@ -112,7 +112,7 @@ def _compile_linearisation(model: Model, degree: int) -> tuple[Any, Any]:
                 found.jacobians[t, i, n], found.jacobians[t, i, n + 1], found.jacobians[t, i, n + 2] = now, last, older
         return value, peak
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def track_states(nominal, amplitude, unit, nominal_inputs, states, slopes, weights, u):
         gains, S, SA, SB = np.zeros((len(u), n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
         for t in range(len(u) - 1, -1, -1):

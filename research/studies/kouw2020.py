@@ -29,7 +29,7 @@ from agents.policies import make_policy
 from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
-from estimator.offline import PEMNARX
+from estimator.inference.pem_narx import PEMNARX
 from estimator.support.array_types import FloatArray
 
 if TYPE_CHECKING:

@@ -220,7 +220,7 @@ def coverage(estimator: OnlineEstimator, training: Regime, test: Regime) -> floa
     """
     copy = deepcopy(estimator)
     copy.run(test.u, test.y)
-    y = np.concatenate([training.y[len(training.y) - copy.waits :], test.y])[: len(copy.forecasts)]
+    y = np.concatenate([training.y[len(training.y) - copy.lookahead :], test.y])[: len(copy.forecasts)]
     return coverage_of(copy.forecasts, y)
 
 

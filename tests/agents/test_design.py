@@ -10,8 +10,8 @@ from tables import table
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from estimator import SILVERBOX_TWIN, silverbox_prior
-from estimator.engine.gradient import pieces
-from estimator.information import fisher_information
+from estimator.engine.adjoint import compile_adjoint
+from estimator.inference.fisher_information import fisher_information
 from estimator.models.difference_equation import difference
 from estimator.rigs.physical_parameters import coefficients_of
 
@@ -135,4 +135,4 @@ def test_improvement_keeps_an_energy():
 
 def test_a_spline_is_refused():
     with pytest.raises(ValueError, match="degree must be 0 or 1"):
-        pieces(PAPER, 5)
+        compile_adjoint(PAPER, 5)

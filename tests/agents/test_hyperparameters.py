@@ -15,7 +15,7 @@ from agents.training.hyperparameters import (
 )
 from duffing_env import TRACKS
 from estimator import Channel, Rig
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 SHORT = "duffing_env/Short-v0"
 

@@ -13,8 +13,8 @@ from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator.belief import Belief
-from estimator.engine.imagination import LOST, imagination
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
+from estimator.engine.expected_update import DIVERGED_SCORE, compile_expected_update
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -165,7 +165,7 @@ def test_imagination_is_the_plain_recursion(case, walks):
     u = rng.normal(0.0, 0.3, (6, LANES))
     W, found = block_after(model, degree, belief, u, terms(model, walk=walk), last=0.1)
     factor = np.tril(rng.normal(0.0, 30.0, (k, k)))
-    place = imagination(model, degree).layout
+    place = compile_expected_update(model, degree).layout
     found.evaluate(W.reshape(-1), factor, 0.5)
     for j in range(0, LANES, 11):
         mean, cov, surprise = expected(case, belief, u[:, j], 0.1, walk)
@@ -192,7 +192,7 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
         model, limit=limit, input_weight=3.0, goal=0.1, goal_weight=4.0, accumulated_noise=5.0, hard_margin=firm
     )
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
-    place = imagination(model, degree).layout
+    place = compile_expected_update(model, degree).layout
     shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
     assert W[place["SURPRISE"], 0] == 0.0  # the output before the first sample has been seen
     # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
@@ -213,7 +213,7 @@ def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach
     told = terms(model, limit=1.0, margin=3.0, recoverable_step=reach)
     u = np.stack([np.full(LANES, 0.1), np.linspace(-0.15, 0.15, LANES)])
     W, _ = block_after(model, 0, belief, u, told)
-    place = imagination(model, 0).layout
+    place = compile_expected_update(model, 0).layout
     shown, alone, surprise = (W[place[row]] for row in ("SHOWN", "SPREAD", "SURPRISE"))
     assert (surprise > 0).all()
     # The input that brakes hardest is -0.15 where the sensor shows more than 0 and rises with the input.
@@ -236,7 +236,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     value, _ = found.criterion(known, 1e3, 0.0, start, u, found.workspace(8))
     W, found = block_after(model, 0, belief, np.repeat(u[:, None], LANES, axis=1), terms(model, limit=1e3))
     found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
-    assert value == pytest.approx(W[imagination(model).layout["SCORE"], 0], abs=1e-6)
+    assert value == pytest.approx(W[compile_expected_update(model).layout["SCORE"], 0], abs=1e-6)
 
 
 def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
@@ -245,9 +245,9 @@ def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     u = np.full((40, LANES), 0.01)
     u[:, 5] = 50.0  # far beyond where the difference equation is stable
     W, found = block_after(model, 0, belief, u, terms(model))
-    place = imagination(model, 0).layout
+    place = compile_expected_update(model, 0).layout
     found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
-    assert W[place["SCORE"], 5] == LOST
+    assert W[place["SCORE"], 5] == DIVERGED_SCORE
     others = np.delete(W[place["SCORE"]], 5)
     np.testing.assert_array_equal(others, others[0])
     assert others[0] > 0
@@ -281,7 +281,7 @@ def test_few_steps_are_enough_to_plan_with():
     compile_energy_limited_plan(fine).begin(belief.record.copy(), precision, start)
     known = NominalSystem(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
     nats = [exact.criterion(known, 1e3, 0.0, start, u[:, j].copy(), exact.workspace(24))[0] for j in range(LANES)]
-    errors = W[imagination(duffing(), 0).layout["SCORE"]] - nats
+    errors = W[compile_expected_update(duffing(), 0).layout["SCORE"]] - nats
     assert 0 < np.abs(errors).max() < 0.06
     assert errors.std() < 0.02
 
@@ -310,10 +310,10 @@ def test_one_state_is_enough():
     belief = weak_prior(DECAY, [0.5], [[0.01]])
     W, found = block_after(DECAY, 0, belief, np.full((3, LANES), 0.1), terms(DECAY))
     found.evaluate(W.reshape(-1), np.zeros((1, 1)), 1.0)
-    assert W[imagination(DECAY, 0).layout["SCORE"], 0] > -0.5 * np.log(0.01)
+    assert W[compile_expected_update(DECAY, 0).layout["SCORE"], 0] > -0.5 * np.log(0.01)
 
 
 @table(("model", "degree", "lag"), [(difference(), 2, 0), (difference(), 0, 2), (duffing(), 1, 1)])
 def test_what_has_no_meaning_is_refused(model, degree, lag):
     with pytest.raises(ValueError, match="degree and lag must be 0 or 1"):
-        imagination(model, degree, lag)
+        compile_expected_update(model, degree, lag)

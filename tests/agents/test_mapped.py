@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from agents.evaluation.track_batch import make_track_batch
-from agents.planning.belief_rollout import LOST, objective_at
+from agents.planning.belief_rollout import DIVERGED_SCORE, objective_at
 from agents.planning.candidate_inputs import INPUT_FRACTIONS, next_uniform
 from agents.planning.grid_beam_search import (
     _N_BISECTIONS,
@@ -18,8 +18,8 @@ from agents.planning.grid_beam_search import (
     score_threshold,
 )
 from agents.policies import make_policy
-from estimator.belief import covariance_places
-from estimator.lanes import LANES
+from estimator.belief import covariance_indices
+from estimator.compilation.simd import LANES
 
 
 @settings(deadline=None)
@@ -35,7 +35,7 @@ def test_no_more_ways_are_followed_than_there_is_place_for(scores, most):
 
 
 def test_ways_that_are_lost_are_followed_when_there_are_no_others():
-    assert score_threshold(np.full(5, LOST), 3) == LOST
+    assert score_threshold(np.full(5, DIVERGED_SCORE), 3) == DIVERGED_SCORE
 
 
 def test_the_best_of_many_are_followed():
@@ -97,7 +97,7 @@ def reference(belief, task, words):
         where = [(z[i] / terms.scales[i] + 1) / 2 * (task.cells - 1) + offsets[i] for i in range(2)]
         return tuple(int(np.clip(w, 0, task.cells - 1)) for w in where)
 
-    P = belief.record[covariance_places(belief.model)]
+    P = belief.record[covariance_indices(belief.model)]
     followed = [(belief.state_mean, P, np.zeros(6), 0.0, 0.0, [])]
     for h in range(task.n_moves):
         tried = (

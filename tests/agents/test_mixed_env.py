@@ -10,7 +10,7 @@ from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.environments.feature_vec_env import REWARD_SCALE
 from agents.training.environments.mixed_vec_env import MixedVecEnv, draw_track_options
 from agents.training.environments.oscillator_family import draw_rig_track
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 TRACK = "duffing_env/Power-v0"
 LENGTHS = {"horizon": [16, 64]}

@@ -25,7 +25,7 @@ from agents.policies.block_planner import BlockPlanner
 from agents.policies.efe_planner import EfePlanner
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator import Channel, Rig
-from estimator.belief import Belief, covariance_places
+from estimator.belief import Belief, covariance_indices
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -422,7 +422,7 @@ def test_on_a_rig_moves_of_several_samples_become_shorter_towards_the_end():
 
 def precisions(belief, plan):
     """(moves + 1, 4, 4) inverse covariances of the coefficients of Eq. (2) before and after each move, in matrices."""
-    P, z, theta = belief.record[covariance_places(belief.model)], belief.state_mean, belief.coefficients_mean
+    P, z, theta = belief.record[covariance_indices(belief.model)], belief.state_mean, belief.coefficients_mean
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
     known = [np.linalg.inv(P[2:, 2:])]
     for u in plan:

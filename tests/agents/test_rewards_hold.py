@@ -7,8 +7,8 @@ from scipy import signal, stats
 
 from duffing_env.batch import spawn_seeds
 from estimator import SILVERBOX_SAMPLING_STEP
-from estimator.information import cramer_rao, fisher_information
-from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.inference.fisher_information import cramer_rao, fisher_information
+from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
 from estimator.rigs.physical_parameters import coefficients_of, to_physical

@@ -14,7 +14,7 @@ from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 from estimator.models.duffing import duffing
 
 EXPERIMENT = ContinuousExperiment()

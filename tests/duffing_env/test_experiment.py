@@ -57,7 +57,7 @@ def prior_of(
 ):
     """The weak prior that fits oscillators about a twin."""
     moments = log_uniform_moments(model, {name: getattr(twin, name) for name in "mcab"}, spread)
-    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape).factorised(factorisation)
+    return weak_prior(model, *moments, process_noise, measurement_noise, noise_shape).with_factorisation(factorisation)
 
 
 def assert_named(make, bad, pattern):

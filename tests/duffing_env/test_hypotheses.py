@@ -18,7 +18,7 @@ from duffing_env.tracks.silverbox_replay import ReplayExperiment
 from duffing_env.tracks.track_registry import TRACKS
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator import OnlineEstimator, Rig
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 #: Nine members each: of four environments they share a block with others'. The reward's kernel tells the mixture's own
 #: free energy, and what a step tells of the information and the posterior are rewards, too.

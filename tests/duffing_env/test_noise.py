@@ -17,7 +17,7 @@ from duffing_env.storage.random_streams import (
     to_uniform,
     word_to_float,
 )
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 
 def numpy_stream(words):

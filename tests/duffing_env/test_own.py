@@ -181,7 +181,7 @@ def test_a_prior_of_ones_own_is_where_episodes_start():
     env.reset(seed=0)
     np.testing.assert_array_equal(env.belief.record, prior.record)
     mean_field = DuffingEnv(prior=prior, factorisation="mean_field")
-    assert mean_field.belief == prior.factorised("mean_field")
+    assert mean_field.belief == prior.with_factorisation("mean_field")
 
 
 def test_oscillators_are_drawn_about_a_mean_of_ones_own():

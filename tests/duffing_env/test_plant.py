@@ -10,7 +10,7 @@ from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw, replay_sample
 from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_TWIN
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 KIND = SimulatedExperiment().kernel_spec
 PLACE = block_layout(KIND)

@@ -20,7 +20,7 @@ from duffing_env import TRACKS
 from duffing_env.rendering import episode_renderer
 from duffing_env.rendering.episode_renderer import HEIGHT, MAX_SAMPLES_SHOWN, WIDTH, EpisodeRenderer
 from duffing_env.tracks.model_env import ModelExperiment
-from estimator.engine.rows import belief_names
+from estimator.engine.storage_layout import belief_rows
 from estimator.priors import silverbox_prior
 from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 
@@ -31,7 +31,7 @@ def changed(**entries):
     """The prior with other numbers in its record."""
     record = PRIOR.record.copy()
     for name, value in entries.items():
-        record[belief_names(PRIOR.model).index(name)] = value
+        record[belief_rows(PRIOR.model).index(name)] = value
     return PRIOR.with_records([record])[0]  # past the checks, as those of an environment
 
 

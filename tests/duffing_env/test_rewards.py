@@ -14,8 +14,8 @@ from duffing_env.rewards.reward_registry import REWARDS, check_reward
 from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief
-from estimator.engine.rows import belief_names
-from estimator.lanes import LANES, lanewise
+from estimator.compilation.simd import LANES, lanewise
+from estimator.engine.storage_layout import belief_rows
 from estimator.models.difference_equation import difference
 from estimator.priors import silverbox_prior
 
@@ -194,7 +194,7 @@ def test_episodes_end_at_the_limit_or_at_the_horizon():
 
 def impossible():
     """Names of rows and values that no belief and no plant may have."""
-    names = belief_names(difference())
+    names = belief_rows(difference())
     variances = [f"P_{name}_{name}" for name in difference().names]
     for name in (*names[:6], *variances, "GAMMA_RATE", "XI_RATE_y", "X_x1", "Y_y"):
         yield from ((name, value) for value in (np.nan, np.inf, -np.inf))

@@ -243,7 +243,7 @@ def test_the_noises_are_as_likely_at_first_as_to_the_estimator_of_the_rig():
 
 def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
     # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
-    prior = silverbox_prior(difference("linear")).factorised("mean_field")
+    prior = silverbox_prior(difference("linear")).with_factorisation("mean_field")
     env = around(Scripted([0.01, 1e200]), "mean_field", prior=prior, max_output=1.0)
     told = []
     for _ in range(2):

@@ -165,7 +165,7 @@ class TwinEnv:
         center = {name: getattr(self.center, name) for name in PARAMETERS}
         moments = log_uniform_moments(self.model, center, spread)
         guesses = process_noise_guess or process_noise, measurement_noise_guess or measurement_noise
-        prior = weak_prior(self.model, *moments, *guesses).factorised(factorisation)
+        prior = weak_prior(self.model, *moments, *guesses).with_factorisation(factorisation)
         self.first_belief = Moments.of(prior)
 
     def reset(self):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator import Channel, Rig
-from estimator.free_run import free_run
+from estimator.inference.free_run import free_run
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.units import Scales

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from tables import table
 
-from estimator.arrays import aligned, copy, copy_scaled, fill, highest
+from estimator.compilation.array_operations import aligned_matrix, copy, copy_scaled, fill, index_of_max
 
 
 def test_numbers_go_where_they_are_told():
@@ -20,13 +20,13 @@ def test_numbers_go_where_they_are_told():
 
 def test_the_highest_is_the_first_of_its_like():
     values = np.array([1.0, 3.0, 3.0, 9.0])
-    assert highest(values, 3) == 1
-    assert highest(values, 4) == 3
+    assert index_of_max(values, 3) == 1
+    assert index_of_max(values, 4) == 3
 
 
 @numba.njit
 def address(rows, size):
-    matrix = aligned(rows, size)
+    matrix = aligned_matrix(rows, size)
     matrix[:] = 1.0
     return matrix, matrix.ctypes.data
 

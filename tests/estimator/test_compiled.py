@@ -13,11 +13,11 @@ from typing import ClassVar
 import pytest
 from numba.core import event
 
-from estimator import compiled
-from estimator.engine import cache as generated
+from estimator.compilation import disk_cache
+from estimator.engine import source_cache as generated
 
 SOURCE = """
-from estimator.lanes import kernel
+from estimator.compilation.simd import kernel
 
 @kernel
 def run(x):
@@ -37,12 +37,12 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "run_of_compiled.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
-    compiled.folder.cache_clear()
-    compiled._warn_of_damage.cache_clear()
+    disk_cache.cache_folder.cache_clear()
+    disk_cache._warn_damaged.cache_clear()
     yield tmp_path / "compiled"
     sys.modules.pop("run_of_compiled", None)
-    compiled.folder.cache_clear()
-    compiled._warn_of_damage.cache_clear()
+    disk_cache.cache_folder.cache_clear()
+    disk_cache._warn_damaged.cache_clear()
 
 
 def fresh():
@@ -69,7 +69,7 @@ def test_compiled_code_is_read_again(place):
 
 def test_code_that_calls_what_numba_brings_is_read_by_another_process(tmp_path):
     """The symbols of BLAS are there only once Numba has imported what brings them."""
-    source = "from estimator.lanes import kernel\n@kernel\ndef run(x):\n    return x @ x\n"
+    source = "from estimator.compilation.simd import kernel\n@kernel\ndef run(x):\n    return x @ x\n"
     (tmp_path / "run_of_compiled.py").write_text(source)
     program = "import numpy as np\nfrom run_of_compiled import run\n"
     program += "print(run(np.ones(3)), sum(run.stats.cache_hits.values()))"
@@ -147,12 +147,12 @@ def test_where_nothing_can_be_written_it_runs_with_one_warning(place, tmp_path, 
 
 
 def test_a_folder_that_becomes_read_only_costs_nothing_but_time(place, monkeypatch):
-    assert compiled.folder() == place
+    assert disk_cache.cache_folder() == place
 
     def refuse(*args, **kwargs):
         raise PermissionError("read-only file system")
 
-    monkeypatch.setattr(compiled.tempfile, "mkstemp", refuse)
+    monkeypatch.setattr(disk_cache.tempfile, "mkstemp", refuse)
     assert called() == (42, 0)
     assert loaded()[0] == 1
     assert not list(place.iterdir())
@@ -163,10 +163,10 @@ def test_a_user_without_a_home_gets_no_folder_called_tilde(tmp_path, monkeypatch
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)
     monkeypatch.chdir(tmp_path)
-    compiled.folder.cache_clear()
+    disk_cache.cache_folder.cache_clear()
     with pytest.warns(RuntimeWarning, match="no folder can be written"):
-        assert compiled.folder() is None
-    compiled.folder.cache_clear()
+        assert disk_cache.cache_folder() is None
+    disk_cache.cache_folder.cache_clear()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 
@@ -174,7 +174,7 @@ def test_the_package_starts_without_a_home_and_with_nothing_to_write(tmp_path):
     (tmp_path / "file").write_text("")
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
     environment["NUMBA_CACHE_DIR"] = environment["XDG_CACHE_HOME"] = str(tmp_path / "file" / "folder")
-    text = "import warnings; warnings.simplefilter('error'); import estimator.online, estimator.engine.tasks"
+    text = "import warnings; warnings.simplefilter('error'); import estimator.online, estimator.engine.kernels"
     subprocess.run([sys.executable, "-c", text], env=environment, check=True, cwd=Path(__file__).parents[2])
 
 
@@ -189,7 +189,7 @@ def loaded():
         made.append(1)
         return "def answer():\n    return number\n"
 
-    code = generated.load("toy", "answer", "key", make, {"number": 1})
+    code = generated.load_generated("toy", "answer", "key", make, {"number": 1})
     return code.answer(), len(made)
 
 
@@ -237,7 +237,7 @@ class Timer:
 
 def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
     monkeypatch.setattr(Timer, "asked", [])
-    watching = compiled.Compilation(now=itertools.count(0.0, 1.5).__next__, timer=Timer)
+    watching = disk_cache.CompilationNotice(now=itertools.count(0.0, 1.5).__next__, timer=Timer)
     event.register("numba:compile", watching)
     try:
         assert called() == (42, 0)
@@ -254,7 +254,7 @@ def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
 def test_what_took_longer_than_the_timer_could_say_is_said_of_the_next(place, monkeypatch):
     """Where the timer is late, on a busy machine."""
     monkeypatch.setattr(Timer, "asked", [])
-    watching = compiled.Compilation(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
+    watching = disk_cache.CompilationNotice(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
     event.register("numba:compile", watching)
     try:
         assert called() == (42, 0)
@@ -276,6 +276,6 @@ def test_garbage_is_collected_again_after_compilation(place):
 
 
 def test_the_garbage_of_others_is_left_to_them():
-    text = "import gc, estimator.compiled, agents.commands; print(gc.get_freeze_count(), gc.isenabled())"
+    text = "import gc, estimator.compilation.disk_cache, agents.commands; print(gc.get_freeze_count(), gc.isenabled())"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "True"]

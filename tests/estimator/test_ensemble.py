@@ -10,9 +10,24 @@ from tables import table
 
 from estimator import Channel, OnlineEstimator, Rig, difference, recorded_prior, silverbox_prior
 from estimator.belief import Belief
-from estimator.ensemble import FARTHEST, LEVELS, displaced, first_weights, matched_gamma, priors, side_by_side
-from estimator.inference.mixture import SWITCHING, foretell, leave_out, mixing, switch, weigh
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
+from estimator.inference.noise_grid import (
+    MAX_RATIO_FACTOR,
+    TOTAL_STD_FACTORS,
+    initial_weights,
+    member_priors,
+    moment_matched_gamma,
+    pack_into_lanes,
+    scale_noises,
+)
+from estimator.inference.noise_mixture import (
+    SWITCHING_PROBABILITY,
+    apply_switching,
+    compile_mixture,
+    forecast_mixture,
+    mark_diverged,
+    reweight,
+)
 from estimator.rigs.rig_prior import rig_prior
 
 RATIOS = 5
@@ -37,7 +52,7 @@ def members(name):
     model, prior = MODELS[name]["model"], MODELS[name]["prior"]
     for level in (1 / 3, 1, 3):
         for factor in (1 / 30, 30**-0.5, 1, 30**0.5, 30):
-            g_shape, g_rate, n_shape, n_rate = displaced(prior.noises, factor, level)
+            g_shape, g_rate, n_shape, n_rate = scale_noises(prior.noises, factor, level)
             moved = Belief.of(model, prior.mean, prior.cov, (g_shape, g_rate), (n_shape, n_rate))
             yield OnlineEstimator(**MODELS[name] | {"prior": moved})
 
@@ -49,7 +64,7 @@ def mixed(weights, energies, predictions):
     """The twin of `weigh`, in logarithms: weights, free energies (T, iterations), forecasts (T, 2)."""
     log_weights, free_energies, forecasts = np.log(weights), [], []
     for F, (means, variances) in zip(energies.transpose(1, 2, 0), predictions.transpose(1, 2, 0), strict=True):
-        w = (1 - SWITCHING) * np.exp(log_weights) + SWITCHING / len(weights)
+        w = (1 - SWITCHING_PROBABILITY) * np.exp(log_weights) + SWITCHING_PROBABILITY / len(weights)
         alive = np.isfinite(F[-1]) & np.isfinite(means)
         w = np.where(alive, w, 0) / w[alive].sum()
         F, means, variances = F[:, alive], means[alive], variances[alive]
@@ -66,11 +81,11 @@ def take(weights, energies, predictions, free_energies, forecasts):
     """One sample as the estimator takes it: energies (M, iterations), predictions (M, 2); gives the weights."""
     energies, predictions = energies.copy(), predictions[:, None].copy()
     for each, predicted in zip(energies, predictions, strict=True):
-        leave_out(each, predicted)
+        mark_diverged(each, predicted)
     shares = np.repeat(weights[:, None], energies.shape[1], axis=1)
-    switch(shares, energies)
-    foretell(shares, predictions, forecasts[None])
-    weigh(shares, energies, free_energies)
+    apply_switching(shares, energies)
+    forecast_mixture(shares, predictions, forecasts[None])
+    reweight(shares, energies, free_energies)
     return shares[:, -1]
 
 
@@ -111,22 +126,22 @@ def test_nothing_left_is_not_finite():
 
 def test_displacement_keeps_the_shapes_and_says_ratio_and_sum():
     noises = np.array([2.0, 2.0 * 3e-3**2, 5.0, 5.0 * 1e-3**2])
-    moved = displaced(noises, 7.0, 3.0)
+    moved = scale_noises(noises, 7.0, 3.0)
     q, r = moved[1] / moved[0], moved[3] / moved[2]
     assert (moved[0], moved[2]) == (2.0, 5.0)
     assert np.sqrt(q / r) == pytest.approx(7 * 3)
     assert q + r == pytest.approx(9 * (3e-3**2 + 1e-3**2))
-    np.testing.assert_allclose(displaced(noises, 1.0, 1.0), noises, rtol=1e-14)
+    np.testing.assert_allclose(scale_noises(noises, 1.0, 1.0), noises, rtol=1e-14)
 
 
 def test_first_weights_are_half_a_cauchy_density_of_the_ratio():
-    records = priors(silverbox_prior(), (3, 1))
+    records = member_priors(silverbox_prior(), (3, 1))
     middle = np.log(2e-3)
     ratios = np.sqrt(records[:, -3] / records[:, -4] / (records[:, -1] / records[:, -2]))
     # A density of the logarithm is that of the ratio, 1/(1 + (ratio/scale)²), times the ratio.
     density = ratios / (1 + (ratios / np.exp(middle)) ** 2)
-    np.testing.assert_allclose(first_weights(records, middle), density / density.sum(), rtol=1e-12)
-    np.testing.assert_array_equal(first_weights(records), [1 / 3] * 3)
+    np.testing.assert_allclose(initial_weights(records, middle), density / density.sum(), rtol=1e-12)
+    np.testing.assert_array_equal(initial_weights(records), [1 / 3] * 3)
 
 
 def test_only_a_rig_with_a_guess_says_where_noises_are_likely():
@@ -142,19 +157,20 @@ def test_only_a_rig_with_a_guess_says_where_noises_are_likely():
 
 
 def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
-    assert matched_gamma(np.ones(1), np.array([3.0]), np.array([2e-6])) == pytest.approx((3.0, 2e-6), rel=1e-12)
+    assert moment_matched_gamma(np.ones(1), np.array([3.0]), np.array([2e-6])) == pytest.approx((3.0, 2e-6), rel=1e-12)
     # Of shapes this large 1/g is normal about rate/shape, with the relative variance 1/shape.
     rng = np.random.default_rng(1)
     weights, shapes, rates = np.array([0.2, 0.8]), np.array([3e3, 1e4]), np.array([3e3, 2e4])
     which = rng.choice(2, 400_000, p=weights)
     variances = 1 / rng.gamma(shapes[which], 1 / rates[which])
-    shape, rate = matched_gamma(weights, shapes, rates)
+    shape, rate = moment_matched_gamma(weights, shapes, rates)
     assert rate / shape == pytest.approx(variances.mean(), rel=0.003)
     assert 1 / shape == pytest.approx(variances.var() / variances.mean() ** 2, rel=0.01)
     # The same in compiled code, of two noises.
     records = np.column_stack([np.zeros((2, 6 + 21)), shapes, rates, shapes, 2 * rates])
     np.testing.assert_allclose(
-        mixing(6).mixture(side_by_side(records, LANES), weights)[1][6 + 21 :], [shape, rate, shape, 2 * rate]
+        compile_mixture(6).mixture(pack_into_lanes(records, LANES), weights)[1][6 + 21 :],
+        [shape, rate, shape, 2 * rate],
     )
 
 
@@ -170,9 +186,9 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
     weights = rng.dirichlet(np.ones(members), n).T.copy()
     if members > 1:
         records[1, :, 8], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
-    found, size = mixing(names), records.shape[2]
+    found, size = compile_mixture(names), records.shape[2]
     before = np.full((LANES, size), np.nan)
-    blocks = side_by_side(np.concatenate([before, records.reshape(-1, size)]), LANES)
+    blocks = pack_into_lanes(np.concatenate([before, records.reshape(-1, size)]), LANES)
     shares, mixed_records = np.empty(members * n), np.empty((size, LANES))
     found.mix(blocks, 1, weights, shares, mixed_records.reshape(-1), LANES)
     for j in range(n):
@@ -181,19 +197,19 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
         mean = own @ means[kept, j]
         off = means[kept, j] - mean
         cov = np.einsum("m,mij->ij", own, covs[kept, j] + off[:, :, None] * off[:, None, :])
-        gammas = [matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in (0, 2)]
+        gammas = [moment_matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in (0, 2)]
         expected = np.concatenate([mean, cov[upper], *gammas])
         np.testing.assert_allclose(mixed_records[:, j], expected, rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(shares.reshape(members, n)[kept, j], own, rtol=1e-14)
         assert (shares.reshape(members, n)[~kept, j] == 0).all()
-        of_one, record = found.mixture(side_by_side(records[:, j], LANES), weights[:, j].copy())
+        of_one, record = found.mixture(pack_into_lanes(records[:, j], LANES), weights[:, j].copy())
         np.testing.assert_array_equal(record, mixed_records[:, j])
         np.testing.assert_array_equal(of_one, shares.reshape(members, n)[:, j])
 
 
 def test_a_mixture_of_no_finite_member_is_nothing():
     records = np.full((2, 6 + 21 + 4), np.nan)
-    assert np.isnan(mixing(6).mixture(side_by_side(records, LANES), np.full(2, 0.5))[1]).all()
+    assert np.isnan(compile_mixture(6).mixture(pack_into_lanes(records, LANES), np.full(2, 0.5))[1]).all()
 
 
 # --- The estimator -------------------------------------------------------------------------------------------------
@@ -292,10 +308,10 @@ def test_where_one_noise_hides_the_other_it_says_so():
     estimator = OnlineEstimator(noise_hypotheses=9)
     first = estimator.noise_ratio
     assert first.std == pytest.approx(first.prior_std)
-    width = 2 * np.log(FARTHEST) * 9 / 8  # nine steps, as a density that is constant in the logarithm
+    width = 2 * np.log(MAX_RATIO_FACTOR) * 9 / 8  # nine steps, as a density that is constant in the logarithm
     assert first.prior_std == pytest.approx(width / np.sqrt(12))
     assert first.mean == pytest.approx(0, abs=1e-12)
-    assert len(LEVELS) * 9 == len(estimator.arrays()["weights"])
+    assert len(TOTAL_STD_FACTORS) * 9 == len(estimator.arrays()["weights"])
     estimator.run(*noisy(2e-3, 1e-5, 1500))
     assert estimator.noise_ratio.std > 0.5
     assert estimator.belief.gamma_mean * 2e-3**2 == pytest.approx(1, abs=0.2)

@@ -7,7 +7,6 @@ import pytest
 from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
-from estimator.free_run import free_run
 from estimator.identification.likelihood.identification_problem import (
     MAX_UNSTATED_DELAY,
     IdentificationProblem,
@@ -15,6 +14,7 @@ from estimator.identification.likelihood.identification_problem import (
 )
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import FitHypothesis
+from estimator.inference.free_run import free_run
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.rig_prior import belief_from_moments

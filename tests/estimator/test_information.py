@@ -7,7 +7,13 @@ from reference.plants import CASES
 from tables import table
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
-from estimator.information import cramer_rao, fisher_information, follow, relative_covariance, sampled
+from estimator.inference.fisher_information import (
+    cramer_rao,
+    filter_records,
+    fisher_information,
+    inputs_by_sample,
+    relative_covariance,
+)
 from estimator.rigs.physical_parameters import coefficients_of
 
 Q, R = 5e-4, 3e-4
@@ -190,13 +196,13 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
             [along(case, row, q, r, state=state, cov=spread**2).shown for row, state in zip(u, begin, strict=True)]
         )
         y += r * rng.standard_normal(y.shape)
-        laid, cov = sampled(model, u, int(interpolation == "linear")), spread**2 * np.eye(model.n_states)
-        found = follow(model, points, laid, y, noises, cov, *((begin,) if spread else ()))
+        laid, cov = inputs_by_sample(model, u, int(interpolation == "linear")), spread**2 * np.eye(model.n_states)
+        found = filter_records(model, points, laid, y, noises, cov, *((begin,) if spread else ()))
         for row in range(2):
             expected = along(case, u[row], q, r, y[row], begin[row], spread**2)
             assert found.loss[row] == pytest.approx(expected.loss, rel=1e-9)
             std = 1 / np.sqrt(np.diag(found.information[row]))
-            np.testing.assert_allclose(found.slope[row] * std, expected.slope * std, atol=1e-6)
+            np.testing.assert_allclose(found.gradient[row] * std, expected.gradient * std, atol=1e-6)
             assert_informations_agree(found.information[row], expected.information, 1e-9)
         np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
     if model.is_continuous:
@@ -204,7 +210,7 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
     # In standard deviations. Left out is what S and the gain tell, which is as small as the noise beside u.
     for j, h in enumerate(1e-3 * std * np.eye(len(c))):
         up, down = (along(case, u[1], q, r, y[1], begin[1], spread**2, c + s * h).loss for s in (1, -1))
-        assert found.slope[1, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)
+        assert found.gradient[1, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)
 
 
 def test_spare_lanes_and_other_series_change_nothing():

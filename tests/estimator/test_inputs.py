@@ -8,15 +8,15 @@ from scipy.interpolate import make_interp_spline
 from tables import table
 
 from estimator import Rig, difference, duffing
-from estimator.inputs import feed
+from estimator.inference.input_interpolation import input_stencil
 
 
 def rows(model, rig, u):
     """(T, rows) what a model takes on the way to each sample."""
-    way = feed(model, rig)
-    if way.at_once:
-        return way.pieces(u)
-    before = np.full(way.past, u[0] if way.fills else 0.0)
+    way = input_stencil(model, rig)
+    if way.needs_whole_record:
+        return way.spline_coefficients(u)
+    before = np.full(way.n_past, u[0] if way.repeats_first else 0.0)
     padded, window = np.concatenate([before, u]), way.stencil.shape[1]
     return np.array([way.stencil @ padded[t : t + window] for t in range(len(u))])
 
@@ -50,8 +50,8 @@ def at(pieces, tau):
 
 
 def test_look_ahead_is_the_quintic_through_its_window():
-    way = feed(duffing(), Rig.silverbox("look_ahead"))
-    assert (way.waits, way.past, way.stencil.shape) == (True, 9, (6, 10))
+    way = input_stencil(duffing(), Rig.silverbox("look_ahead"))
+    assert (way.lookahead, way.n_past, way.stencil.shape) == (True, 9, (6, 10))
     found = rows(duffing(), Rig.silverbox("look_ahead"), U)  # the t-th is on the way to sample t - 1
     for t in range(9, 40):
         spline = make_interp_spline(np.arange(10), U[t - 9 : t + 1], k=5)
@@ -59,8 +59,8 @@ def test_look_ahead_is_the_quintic_through_its_window():
             assert at(found[t : t + 1], tau)[0] == pytest.approx(float(spline(7 + tau)), abs=1e-10)
     np.testing.assert_allclose(at(found[9:], 0.0), U[7:38], atol=1e-12)
     np.testing.assert_allclose(at(found[9:], 1.0), U[8:39], atol=1e-12)
-    delayed = feed(duffing(), Rig.silverbox("look_ahead", 1))
-    assert not delayed.waits  # the next input but for the delay is known
+    delayed = input_stencil(duffing(), Rig.silverbox("look_ahead", 1))
+    assert not delayed.lookahead  # the next input but for the delay is known
 
 
 @table("delay", [0, 1])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tables import table
 
-from estimator import lanes
-from estimator.lanes import LANES, jit, lanewise, of_lane, part, rows
+from estimator.compilation import simd
+from estimator.compilation.simd import LANES, jit, jit_closure, jit_single_lane, lanewise, number_rows
 
 LAYOUT = {"a": 0, "b": 1, "total": 2, "product": 3}
 
@@ -39,12 +39,12 @@ def test_an_inner_function_is_called_from_compiled_code_and_from_python():
 
 
 def test_rows_are_numbered_in_order():
-    assert rows("a b", " c\n d", start=3) == {"a": 3, "b": 4, "c": 5, "d": 6}
+    assert number_rows("a b", " c\n d", first_row=3) == {"a": 3, "b": 4, "c": 5, "d": 6}
 
 
 def test_rows_refuse_a_name_that_stands_there_twice():
     with pytest.raises(ValueError, match=re.escape("every row once, but ['b'] stand there twice; rename")):
-        rows("a b", "c b")
+        number_rows("a b", "c b")
 
 
 def add_and_multiply(a, b, factor, shift):
@@ -80,10 +80,10 @@ def test_one_lane_is_touched_or_none():
     W = block()
     before = W.reshape(-1, LANES).copy()
     a, b = before[:2]
-    total, product = of_lane(LAYOUT, sum_and_product)(W, 5)
+    total, product = jit_single_lane(LAYOUT, sum_and_product)(W, 5)
     np.testing.assert_allclose([total, product], [a[5] + b[5], a[5] * b[5]], rtol=1e-14)
     np.testing.assert_array_equal(W.reshape(-1, LANES), before)
-    lanewise(LAYOUT, "total product", uniform="factor shift", one=True)(add_and_multiply)(W, 5, 2.0, 100.0)
+    lanewise(LAYOUT, "total product", uniform="factor shift", single_lane=True)(add_and_multiply)(W, 5, 2.0, 100.0)
     changed = W.reshape(-1, LANES) != before
     np.testing.assert_array_equal(np.argwhere(changed), [[2, 5], [3, 5]])
 
@@ -96,7 +96,7 @@ def test_a_parameter_is_a_row_or_uniform(uniform):
 
 def test_the_digest_of_sources_covers_each_of_them(tmp_path):
     def digest(folder):
-        return lanes.source_digest.__wrapped__((folder,))
+        return simd.source_digest.__wrapped__((folder,))
 
     (tmp_path / "folder").mkdir()
     (tmp_path / "kernel.py").write_text("a = 1\n")
@@ -113,22 +113,24 @@ def test_the_digest_of_sources_covers_each_of_them(tmp_path):
 
 
 def test_code_depends_on_its_package_and_those_below():
-    root = Path(lanes.__file__).parents[1]
-    names = {name: [folder.name for folder in lanes.sources_of(str(root / name))] for name in (
-        "estimator/engine/emit.py", "duffing_env/kernel.py", "agents/planning/receding_horizon.py", "benchmarks/component_timing.py",
+    root = Path(simd.__file__).parents[1]
+    names = {name: [folder.name for folder in simd.source_folders(str(root / name))] for name in (
+        "estimator/engine/printer_numba.py", "duffing_env/kernel.py", "agents/planning/receding_horizon.py", "benchmarks/component_timing.py",
     )}  # fmt: skip
     below = ["estimator", "duffing_env", "agents"]
     assert list(names.values()) == [below[:1], below[:2], below, [*below, "benchmarks"]]
 
 
 def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
-    (tmp_path / "scalar_of_lanes.py").write_text("from estimator.lanes import jit\n\n@jit\ndef f():\n    return 1\n")
+    (tmp_path / "scalar_of_lanes.py").write_text(
+        "from estimator.compilation.simd import jit\n\n@jit\ndef f():\n    return 1\n"
+    )
     (tmp_path / "kernel_of_lanes.py").write_text(
-        "from estimator.lanes import kernel\nfrom scalar_of_lanes import f\n\n@kernel\ndef run():\n    return f()\n"
+        "from estimator.compilation.simd import kernel\nfrom scalar_of_lanes import f\n\n@kernel\ndef run():\n    return f()\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    digest = lanes.source_digest.__wrapped__
-    monkeypatch.setattr(lanes, "source_digest", digest)  # a new process reads the sources again
+    digest = simd.source_digest.__wrapped__
+    monkeypatch.setattr(simd, "source_digest", digest)  # a new process reads the sources again
 
     def result():
         for name in ("scalar_of_lanes", "kernel_of_lanes"):
@@ -140,13 +142,15 @@ def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
     assert result() == (1, 0)
     assert result() == (1, 1)
     # Only the called function changes; its file is longer, so that Python itself compiles it again.
-    (tmp_path / "scalar_of_lanes.py").write_text("from estimator.lanes import jit\n\n@jit\ndef f():\n    return 1234\n")
+    (tmp_path / "scalar_of_lanes.py").write_text(
+        "from estimator.compilation.simd import jit\n\n@jit\ndef f():\n    return 1234\n"
+    )
     assert result() == (1234, 0)
 
 
 def test_functions_that_differ_have_names_that_differ():
     """The linker takes one of two functions of a name for both, where two processes compiled them."""
-    layout = rows("p q r s")
+    layout = number_rows("p q r s")
 
     def double(p):
         return 2.0 * p
@@ -156,7 +160,7 @@ def test_functions_that_differ_have_names_that_differ():
     assert len({loop.py_func.__qualname__ for loop in loops}) == 5
 
     def outer(kind):
-        @part(kind)
+        @jit_closure(kind)
         def inner(p):
             return p
 
@@ -166,7 +170,7 @@ def test_functions_that_differ_have_names_that_differ():
 
 
 def test_functions_within_functions_are_named_apart():
-    """Those of two kinds would have one name, and the linker would take one for the other (`estimator.lanes.part`)."""
+    """Those of two kinds would have one name, and the linker would take one for the other (`estimator.compilation.simd.jit_closure`)."""
     root = Path(__file__).parents[2]
     unnamed = []
 

@@ -6,7 +6,7 @@ from reference.filters import filter_paper
 from scipy.optimize import minimize
 
 from estimator import SILVERBOX_TWIN, difference, silverbox_prior, weak_prior
-from estimator.maximum_a_posteriori import maximum_a_posteriori
+from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.pendulum import PENDULUM
 from estimator.rigs.physical_parameters import coefficients_of
 

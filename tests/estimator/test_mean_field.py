@@ -21,7 +21,7 @@ from targets import has_fused_multiply_add
 from estimator.inference import mean_field
 
 LANES, DRAWS = mean_field.LANES, 20_000
-PIECES, ONE = mean_field.pieces(LAYOUT), mean_field.pieces(LAYOUT, lanes=1)
+PIECES, ONE = mean_field.compile_mean_field(LAYOUT), mean_field.compile_mean_field(LAYOUT, lanes=1)
 
 
 def samples(rng, count):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tables import table
 
-from estimator.engine.derive import calculus, symbol
-from estimator.free_run import free_run
-from estimator.information import fisher_information
+from estimator.engine.symbolic import differentiate, symbol
+from estimator.inference.fisher_information import fisher_information
+from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import Term, difference
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import coefficients_of, propagate_to_physical
@@ -53,7 +53,7 @@ def test_what_does_not_fit_is_refused_at_once(given, words):
 
 def test_powers_too_high_for_a_product_are_refused():
     with pytest.raises(ValueError, match="powers of tank must be from -16 to 16, but 'u - loss"):
-        calculus(Model(**{**TANK, "rates": ("u - loss*x**17",)}))
+        differentiate(Model(**{**TANK, "rates": ("u - loss*x**17",)}))
 
 
 @table(
@@ -77,7 +77,7 @@ def test_any_power_is_what_it_says():
     terms = " + ".join(f"{name}*x**{power}" for name, power in zip(names, powers, strict=True))
     coefficients = {"loss": "1", **dict.fromkeys(names, "1")}
     model = Model(**{**TANK, "coefficients": coefficients, "rates": (), "next_state": (f"u + {terms}",)})
-    (slopes,) = calculus(model).by[0][:1]
+    (slopes,) = differentiate(model).jacobian[0][:1]
     for name, power in zip(names, powers, strict=True):
         given = dict(zip(coefficients, [loss, *(1.3 * (name == other) for other in names)], strict=True))
         exponent = eval(power, {"loss": loss})
@@ -127,7 +127,7 @@ def test_a_magnitude_is_what_numpy_says(magnitude):
     for x in (-1.7, 0.0, 1.7):
         expected = 0.25 + 0.4 * abs(x) + abs(np.log(0.4))
         assert free_run(model, [0.4], [0.25], [x])[0] == pytest.approx(expected, rel=1e-14)
-        slope = calculus(model).by[0][0].subs({symbol("x"): x, symbol("loss"): 0.4})
+        slope = differentiate(model).jacobian[0][0].subs({symbol("x"): x, symbol("loss"): 0.4})
         assert float(slope) == pytest.approx(0.4 * np.sign(x))
 
 

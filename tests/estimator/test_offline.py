@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tables import table
 
-from estimator import offline as module
-from estimator.offline import PEMNARX, network, network_jacobian
+from estimator.inference import pem_narx as module
+from estimator.inference.pem_narx import PEMNARX, evaluate_network, network_jacobian
 
 # L (3), d, a (2), c (2), b (3 x 2), and r0. The units bend over the amplitudes that the simulations below reach.
 TRUTH = np.array([1.4, -0.8, 0.2, 0.01, 0.05, -0.03, 0.5, -1.0, 8.0, -5.0, 2.0, 4.0, -3.0, 6.0])
@@ -54,7 +54,7 @@ def fitted():
 def test_network_term_by_term():
     z = np.random.default_rng(0).standard_normal((5, 3))
     expected = [plain_network(TRUTH, np.zeros(3), row) for row in z]
-    np.testing.assert_allclose(network(TRUTH, z), expected, rtol=1e-13)
+    np.testing.assert_allclose(evaluate_network(TRUTH, z), expected, rtol=1e-13)
 
 
 @table("units", [0, 1, 4])
@@ -62,7 +62,7 @@ def test_jacobian_against_central_differences(units):
     rng = np.random.default_rng(units)
     parameters, z = rng.standard_normal(4 + 5 * units), rng.standard_normal((20, 3))
     steps = 1e-5 * np.eye(len(parameters))
-    differences = [(network(parameters + h, z) - network(parameters - h, z)) / 2e-5 for h in steps]
+    differences = [(evaluate_network(parameters + h, z) - evaluate_network(parameters - h, z)) / 2e-5 for h in steps]
     np.testing.assert_allclose(network_jacobian(parameters, z), np.transpose(differences), atol=1e-9)
 
 
@@ -149,7 +149,7 @@ def test_a_diverging_run_is_nan_from_there_on():
     first = int(np.argmax(np.isnan(simulated)))
     assert 2 < first < 3000
     assert np.isnan(simulated[first:]).all()
-    assert 1e5 < simulated[first - 1] <= module.DIVERGED
+    assert 1e5 < simulated[first - 1] <= module.DIVERGED_OUTPUT
 
 
 def test_steep_units_saturate():

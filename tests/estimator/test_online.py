@@ -61,7 +61,7 @@ def test_run_is_repeated_update(kind, samples, monkeypatch, capsys):
         assert_same(whole, other)
     assert "Identifying" in capsys.readouterr().err
     assert whole.free_energy == free_energies[-1, -1]
-    assert len(free_energies) == 120 - whole.waits
+    assert len(free_energies) == 120 - whole.lookahead
 
 
 @table("kind", KINDS)
@@ -74,7 +74,7 @@ def test_unchanged_after_an_update_that_raised(kind, bad, samples):
     with pytest.raises(ValueError, match=re.escape("u and y must keep the belief finite, but near sample ")):
         estimator.run([0.1, 0.1, 0.1], [0.05, bad, 0.05])
     assert_same(estimator, untouched)
-    if not estimator.waits:
+    if not estimator.lookahead:
         with pytest.raises(ValueError, match=re.escape(f"near sample 0 (u = 0.1, y = {bad})")):
             estimator.update(0.1, bad)
     np.testing.assert_array_equal(estimator.forecasts, before)

@@ -8,7 +8,7 @@ from estimators import ONE_TAP, OWN_TAPS, pendulum_estimator, record
 from tables import table
 
 from estimator import OnlineEstimator, Rig, difference, duffing, recorded_prior, silverbox_prior
-from estimator.posteriors import posteriors
+from estimator.inference.batch_posteriors import posteriors
 
 LENGTHS = [40, 7, 0, 40] + 31 * [25]  # more than a block of lanes
 HELD = Rig.silverbox("zero_order", -1)
@@ -44,7 +44,7 @@ def test_beliefs_are_those_of_one_estimator_after_the_other(case, records):
         estimator = OnlineEstimator(prior.model, prior, same, factorisation=prior.factorisation)
         estimator.run(u[row, :length], y[row, :length])
         np.testing.assert_allclose(belief.record, estimator.belief.record, rtol=1e-6, atol=1e-14)
-        assert belief._kind == estimator.belief._kind
+        assert belief._identity == estimator.belief._identity
     assert beliefs[2] == prior
 
 

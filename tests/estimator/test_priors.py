@@ -141,14 +141,14 @@ def test_mean_field_begins_without_correlations_of_states_theta_and_eta():
     cov = np.full((6, 6), 0.01) + np.eye(6)
     prior = published_run_prior()
     joint = type(prior).of(PAPER, prior.mean, cov, (2.0, 1.0), (2.0, 1.0))
-    apart = joint.factorised("mean_field")
+    apart = joint.with_factorisation("mean_field")
     assert apart.factorisation == "mean_field"
     parts = np.zeros((6, 6))
     for part in (slice(0, 2), slice(2, 5), slice(5, 6)):
         parts[part, part] = cov[part, part]
     np.testing.assert_array_equal(apart.cov, parts)
     np.testing.assert_array_equal(apart.mean, joint.mean)
-    assert joint.factorised("structured") == joint
+    assert joint.with_factorisation("structured") == joint
 
 
 @table(

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from llvmlite import binding
 from tables import table
 
-from estimator.straight import straight, straight_within
-from estimator.straight.translation import vectorised
+from estimator.compilation.scalar_jit import scalar_jit, scalar_jit_from_source
+from estimator.compilation.scalar_jit.llvm_translation import with_vector_metadata
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 
@@ -24,17 +24,17 @@ def same(actual, expected):
 
 
 # One operation each, so that nothing can be fused with another.
-@straight
+@scalar_jit
 def arithmetic(a, b):
     return a + b, a - b, a * b, -a, (1 / 4) * a
 
 
-@straight
+@scalar_jit
 def comparisons(a, b):
     return a < b, a <= b, a > b, a >= b, a == b, a != b, a == a
 
 
-@straight
+@scalar_jit
 def choices(a, b):
     both = a > 0.0 and b > 0.0
     either = not (a <= 0.0 and b <= 0.0) or a > b
@@ -50,7 +50,7 @@ def test_operations_are_those_of_python(function, a, b):
     same(function(a, b), expected)
 
 
-@straight
+@scalar_jit
 def elementary(a):
     return math.sqrt(a), np.sqrt(a), math.floor(a), math.exp(-a), math.log(a), math.log1p(a), 1.0 / a, a**2
 
@@ -61,7 +61,7 @@ def test_elementary_functions_are_those_of_the_library(a):
     np.testing.assert_allclose(elementary(a), elementary.py_func(a), rtol=4e-16)
 
 
-@straight
+@scalar_jit
 def whole_numbers(i, j):
     half, odd = i // 2, i % 2
     return i + j, i - j, i * j, half, odd, i << 3, i >> 1, i & j, i | j, i ^ j, -i, i < j, half * 0.5, i / 4
@@ -73,7 +73,7 @@ def test_whole_numbers_are_those_of_python(i, j):
     assert whole_numbers(i, j) == whole_numbers.py_func(i, j)
 
 
-@straight
+@scalar_jit
 def bits(x):
     word = np.float64(x).view(np.uint64)
     number = np.float64(x).view(np.int64)
@@ -86,13 +86,13 @@ def test_bits_are_those_of_numpy(x):
     same(bits(x), bits.py_func(x))
 
 
-@straight
+@scalar_jit
 def swapped(pair, more):
     (a, b), c = pair, more[1]
     return (b, a), c
 
 
-@straight
+@scalar_jit
 def called(a, b):
     total = a + b
     (b, a), c = swapped((a, b), (0.0, total))
@@ -112,14 +112,14 @@ def test_functions_take_and_give_tuples():
     assert swapped((1.0, 2.0), (3.0, 4.0)) == ((2.0, 1.0), 4.0)
 
 
-@straight
+@scalar_jit
 def scale(W, place, factor):
     """One row of a block."""
     for j in range(4):
         W[place * 4 + j] = factor * W[place * 4 + j]
 
 
-@straight
+@scalar_jit
 def scale_rows(W, factor):
     """Rows 1 and 2 of a block, twice: loops in loops."""
     for row in range(2):
@@ -136,7 +136,7 @@ def test_functions_of_blocks_write_into_them():
 
 
 def made(factor):
-    @straight
+    @scalar_jit
     def multiplied(a):
         return factor * a
 
@@ -146,20 +146,20 @@ def made(factor):
 def test_what_a_function_has_from_around_is_its_own():
     two, three = made(2.0), made(3.0)
 
-    @straight
+    @scalar_jit
     def both(a):
         return two(a), three(a)
 
     assert both(1.0) == (2.0, 3.0)
-    names = {f.translated(("double",)).name for f in (two, three, made(2.0))}
+    names = {f.translate(("double",)).name for f in (two, three, made(2.0))}
     assert len(names) == 2, "compiled code is joined by names, which must differ where the code does"
 
 
 def test_functions_of_a_source_need_no_file():
     source = (
-        "@straight\ndef double(a):\n    return 2.0 * a\n@straight\ndef fourfold(a):\n    return double(double(a))\n"
+        "@scalar_jit\ndef double(a):\n    return 2.0 * a\n@scalar_jit\ndef fourfold(a):\n    return double(double(a))\n"
     )
-    names = {"straight": straight_within(source)}
+    names = {"scalar_jit": scalar_jit_from_source(source)}
     exec(source, names)
     assert names["fourfold"](1.5) == 6.0
 
@@ -223,7 +223,7 @@ def remembers(W):
     W[0] = b
 
 
-@straight
+@scalar_jit
 def total(W):
     return W[0] + W[1]
 
@@ -261,7 +261,7 @@ def over_lanes(W):
 
 @pytest.mark.parametrize("is_wide", [False, True])
 def test_loops_over_lanes_are_of_eight_where_registers_are_wide(is_wide):
-    module = vectorised(next(iter(straight(over_lanes).translated(("ptr",)).definitions.values())), is_wide)
+    module = with_vector_metadata(next(iter(scalar_jit(over_lanes).translate(("ptr",)).definitions.values())), is_wide)
     text = str(binding.parse_assembly(module))
     assert text.count("llvm.loop.vectorize.width") == is_wide
     assert text.count("br i1") == 2
@@ -274,8 +274,8 @@ def test_turns_of_short_loops_go_side_by_side(lines, turns):
     text = f"def sums(W):\n    for j in range(16):\n        a0 = W[j]\n{sums}        W[16 + j] = a{lines}\n"
     scope: dict[str, Any] = {}
     exec(text, scope)
-    function = straight_within(text)(scope["sums"])
-    module = vectorised(next(iter(function.translated(("ptr",)).definitions.values())), True)
+    function = scalar_jit_from_source(text)(scope["sums"])
+    module = with_vector_metadata(next(iter(function.translate(("ptr",)).definitions.values())), True)
     loop = re.search(r"br i1 .*!llvm\.loop (!\d+)", module)
     assert loop
     count = re.search(rf"^{loop[1]} = .*, (!\d+)}}$", module, re.M)
@@ -312,4 +312,4 @@ def test_turns_of_short_loops_go_side_by_side(lines, turns):
 )
 def test_what_is_not_straight_is_refused(function, arguments, said):
     with pytest.raises(Exception, match=re.escape(said)):
-        straight(function)(*arguments)
+        scalar_jit(function)(*arguments)

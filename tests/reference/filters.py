@@ -249,7 +249,7 @@ class Walk:
 
     Attributes:
         loss: minus the log likelihood, without the constant; 0 where outputs are not followed.
-        slope: (K,) its slope, the gains held.
+        gradient: (K,) its slope, the gains held.
         information: (K, K) Fisher's, of independent sensors, the gains held.
         shown: (T, sensors) what the sensors are expected to show.
         innovations, variances: (T, sensors); innovations are 0 where outputs are not followed.
@@ -258,7 +258,7 @@ class Walk:
     """
 
     loss: float
-    slope: np.ndarray
+    gradient: np.ndarray
     information: np.ndarray
     shown: np.ndarray
     innovations: np.ndarray

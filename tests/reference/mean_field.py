@@ -13,7 +13,7 @@ from estimator.inference import mean_field
 
 TIE = 1e12  # precision of the identity between the second component of z_t and the first of z_{t-1}
 LOG_2PI = np.log(2 * np.pi)
-LAYOUT = mean_field.layout()
+LAYOUT = mean_field.mean_field_layout()
 UPPER = np.triu_indices(6)
 SIZE = 31  # of a record: means, upper triangle, shapes and rates
 

@@ -28,7 +28,7 @@ class Outcome:
 
     Attributes:
         belief: after it.
-        free_energies: by sensor and iteration [nats]; nothing for a sensor whose output is missing.
+        compile_free_energies: by sensor and iteration [nats]; nothing for a sensor whose output is missing.
         scale: (m,) standard deviations as predicted: what errors are measured in.
         condition: by how much rounding is enlarged: sums of absolute values over what they cancel to.
     """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation.oracle import Oracle, TrackSystems
-from estimator.free_run import free_run
+from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from research.oracles.certificate import Certificate
 from research.oracles.input_mixture import BoundMultipliers, improve_mixture

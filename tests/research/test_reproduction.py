@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from duffing_env.plants.silverbox_record import CSV_NAME
-from estimator.offline import PEMNARX
+from estimator.inference.pem_narx import PEMNARX
 from research.studies import kouw2020 as module
 from research.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
 

@@ -29,10 +29,10 @@ from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.planning.projected_gradient import DesignLimits, project_input
 from agents.planning.receding_horizon import compile_receding_horizon
 from agents.policies.efe_planner import EfePlanner
-from estimator.arrays import copy
 from estimator.belief import Belief
-from estimator.engine.motion import coarsened
-from estimator.lanes import kernel
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import kernel
+from estimator.engine.noise_free_response import with_coarse_substeps
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
@@ -109,7 +109,7 @@ def _compile_momentum_ascent(model: Model, degree: int) -> Any:
     """``ascend(systems, limits, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
     workspace_for, criterion_and_gradient = compile_expected_d_optimality(model, degree)
 
-    @kernel(kind=f"{model.name}_{model.digest}_{degree}")
+    @kernel(variant=f"{model.name}_{model.digest}_{degree}")
     def ascend(systems, limits, iterations, u):
         T, workspace = len(u), workspace_for(len(u))
         gradient, best, momentum = workspace.gradient, np.empty(T), np.zeros(T)
@@ -188,7 +188,7 @@ def _climb_candidate(
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
     """As `optimise_block`, from one candidate (T,)."""
     ascend = _compile_momentum_ascent(
-        coarsened(view.model), view.degree
+        with_coarse_substeps(view.model), view.degree
     )  # how safe a block is, is judged with all steps
     planned = set(range(N_SYSTEMS))
 
@@ -224,7 +224,7 @@ def _climb_candidate(
             soft_limit * (1 - min(_FIRST_TIGHTENING * _TIGHTENING_GROWTH**k, _MAX_TIGHTENING)),
         )
         u = ascended(u, soft_limit, _N_STEPS_AFTER_TIGHTENING)
-    share, probability = monte_carlo.share(u[:n_safe_samples], max_probability)
+    share, probability = monte_carlo.safe_scale(u[:n_safe_samples], max_probability)
     return share * u, share, probability
 
 

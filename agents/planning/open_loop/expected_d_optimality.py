@@ -3,7 +3,7 @@
     J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / L - 1)²]
 
 Each term is that of `agents.planning.d_optimality`, for a system with coefficients, a start, noises and disturbances of its
-own. As many systems as there are lanes are followed side by side (`estimator.engine.gradient_lanes`).
+own. As many systems as there are lanes are followed side by side (`estimator.engine.adjoint_simd`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planning.d_optimality import DIVERGED_RATIO, half_log_det, invert_from_cholesky
-from estimator.arrays import fill
-from estimator.engine.feeding import older_inputs
-from estimator.engine.gradient_lanes import paths
-from estimator.engine.rows import input_rows, path_names
-from estimator.lanes import LANES, kernel, part
+from estimator.compilation.array_operations import fill
+from estimator.compilation.simd import LANES, jit_closure, kernel
+from estimator.engine.adjoint_simd import compile_lane_adjoint
+from estimator.engine.input_hold import n_older_inputs
+from estimator.engine.storage_layout import filter_state_rows, input_rows
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -85,18 +85,23 @@ class ExpectedDOptimality(NamedTuple):
 @cache
 def compile_expected_d_optimality(model: Model, degree: int = 0) -> ExpectedDOptimality:
     """The mean worth of inputs over systems of a model; arguments as `agents.planning.d_optimality.compile_d_optimality`."""
-    lane_paths = paths(model, degree)
-    follow, back, n_tape, size = lane_paths.follow, lane_paths.back, lane_paths.n_tape, len(lane_paths.layout) * LANES
+    lane_paths = compile_lane_adjoint(model, degree)
+    follow, back, n_tape, size = (
+        lane_paths.forward,
+        lane_paths.backward,
+        lane_paths.n_tape,
+        len(lane_paths.layout) * LANES,
+    )
     at = {name: row * LANES for name, row in lane_paths.layout.items()}
     first_coefficient = next(iter(model.coefficients))
     F, C, U, Q = at[f"F_{first_coefficient}_{first_coefficient}"], at[first_coefficient], at["U_0"], at["Q"]
     SHOWN, LIVE = at[f"SHOWN_{next(iter(model.outputs))}"], at["LIVE"]
-    n_path, n_inputs, k = len(path_names(model)), len(input_rows(model, degree)), model.n_coefficients
-    entries, n_noises, n_older_inputs = k * (k + 1) // 2, 1 + model.n_outputs, older_inputs(model, degree)
+    n_path, n_inputs, k = len(filter_state_rows(model)), len(input_rows(model, degree)), model.n_coefficients
+    entries, n_noises, n_older = k * (k + 1) // 2, 1 + model.n_outputs, n_older_inputs(model, degree)
     is_linear_input = model.is_continuous and degree == 1
     rows, columns = np.array(list(combinations_with_replacement(range(k), 2))).T.copy()
     compile_key = f"{model.name}_{model.digest}_{degree}"
-    compile_inner = part(compile_key)
+    compile_inner = jit_closure(compile_key)
 
     @compile_inner
     def workspace(samples):
@@ -121,7 +126,7 @@ def compile_expected_d_optimality(model: Model, degree: int = 0) -> ExpectedDOpt
                 W[Q + a * LANES + j] = systems.noises[i, a]
             W[LIVE + j] = 1.0
             for a in range(2):
-                inputs[1 - a, j] = systems.path_starts[i, n_path + a] if a < n_older_inputs else 0.0
+                inputs[1 - a, j] = systems.path_starts[i, n_path + a] if a < n_older else 0.0
             for t in range(len(u)):
                 inputs[2 + t, j] = u[t] + systems.input_disturbances[i, t]
 
@@ -193,7 +198,7 @@ def compile_expected_d_optimality(model: Model, degree: int = 0) -> ExpectedDOpt
                         for a in range(min(n_inputs, t + 1)):
                             gradient[t - a] += A[U + a * LANES + j]
 
-    @kernel(kind=compile_key)
+    @kernel(variant=compile_key)
     def criterion_and_gradient(systems, limit, penalty, u, memory):
         S, total, samples = len(systems.coefficients), 0.0, len(u)
         fill(memory.gradient, 0.0)

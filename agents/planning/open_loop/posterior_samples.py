@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 from scipy.special import betaincinv
 
-from estimator.belief import Belief, covariance_places
-from estimator.free_run import free_run
+from estimator.belief import Belief, covariance_indices
+from estimator.inference.free_run import free_run
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.support.array_types import FloatArray
@@ -49,7 +49,7 @@ def draw_from_records(
     """
     weights = np.where(np.isfinite(records).all(axis=1), weights, 0.0)
     counts = rng.multinomial(n_draws, weights / weights.sum())
-    d, places = len(model.names), covariance_places(model)
+    d, places = len(model.names), covariance_indices(model)
     drawn, noises = [], []
     for record, count in zip(records, counts.tolist(), strict=True):
         if count:
@@ -98,9 +98,9 @@ def noise_as_input(model: Model) -> Callable[..., FloatArray]:
     """
     import sympy as sp
 
-    from estimator.engine.derive import calculus, symbol
+    from estimator.engine.symbolic import differentiate, symbol
 
-    motion_equations, u = calculus(model), symbol("u")
+    motion_equations, u = differentiate(model), symbol("u")
     moved = {name: sp.diff(move, u) for name, move in zip(model.states, motion_equations.moves, strict=True)}
     forces = [
         noise / moved[name] for name, noise in zip(model.states, motion_equations.noise, strict=True) if noise != 0
@@ -199,7 +199,7 @@ class MonteCarloSystems:
         draws = len(self.states) - n_planned
         return max(1, next((k for k in range(draws) if self.probability_bound(k, n_planned) >= max_probability), draws))
 
-    def share(self, u: FloatArray, max_probability: float) -> tuple[float, float]:
+    def safe_scale(self, u: FloatArray, max_probability: float) -> tuple[float, float]:
         """The largest share of inputs whose `violation_probability` of leaving the limit is below a bound, and that probability.
 
         Returns:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from agents.planning.model_probe import ModelView
 from agents.policies.networks.rollout_features import compile_features
-from estimator.arrays import copy
-from estimator.lanes import jit, kernel
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import jit, kernel
 
 Array = npt.NDArray[Any]
 
@@ -143,7 +143,7 @@ def compile_decision(view: ModelView) -> Any:
     """
     workspace, encode = compile_features(view)
 
-    @kernel(kind=view.kind)
+    @kernel(variant=view.kind)
     def decide(observations, setting, with_observation, actor, actions):
         buffers, values, allowed_interval = workspace(), np.empty(actor.sizes[0], np.float32), np.empty(2, np.float32)
         x = np.empty(actor.sizes.sum(), np.float32)

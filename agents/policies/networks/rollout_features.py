@@ -34,9 +34,9 @@ from agents.planning.model_probe import (
     planning_limit,
     probe_time_scales,
 )
-from estimator.arrays import copy, copy_scaled, fill
-from estimator.engine.motion import motion
-from estimator.lanes import jit, kernel, part
+from estimator.compilation.array_operations import copy, copy_scaled, fill
+from estimator.compilation.simd import jit, jit_closure, kernel
+from estimator.engine.noise_free_response import compile_noise_free_response
 from estimator.models.model import Model
 from estimator.support.argument_checks import short_repr
 from estimator.support.array_types import FloatArray
@@ -177,8 +177,8 @@ def compile_features(view: ModelView) -> Any:
     observation itself stands behind the features; ``work``: of ``workspace()``, what is written on.
     """
     model = view.model
-    free_response, layout = motion(*view), observation_layout(model)
-    row, sense, step = free_response.layout, free_response.sense, free_response.step
+    free_response, layout = compile_noise_free_response(*view), observation_layout(model)
+    row, sense, step = free_response.layout, free_response.output_now, free_response.step
     n, k, size, is_odd = model.n_states, model.n_coefficients, len(row), free_response.is_odd
     u, last, older, now, velocity, signal = (
         row[name] for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "SHOWN")
@@ -200,7 +200,7 @@ def compile_features(view: ModelView) -> Any:
         place[f"{what}_up"] for what in ("next", "rest", "peak", "reach", "taught", "braked")
     )
     FREE, OTHERS = place["free_2"], place["to_come"]
-    compile_inner = part(view.kind)
+    compile_inner = jit_closure(view.kind)
 
     @compile_inner
     def workspace():
@@ -372,7 +372,7 @@ def _compile_feature_batch(view: ModelView) -> Any:
     """``encode_batch(observations, setting, own, *features)``: fills in the `ShieldedFeatures` of n observations."""
     workspace, encode = compile_features(view)
 
-    @kernel(kind=view.kind)
+    @kernel(variant=view.kind)
     def encode_batch(
         observations,
         setting,

@@ -17,7 +17,7 @@ from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncode
 from agents.sb3_vec_env import BatchVecEnv, info_of_row, infos_by_row
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, has_shaping_potential
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 from estimator.support.argument_checks import short_repr
 
 #: Draws what a group plays next: the id of a track, and the options of its environments.
@@ -64,7 +64,7 @@ class _RowGroup:
 
 
 class MixedVecEnv(BatchVecEnv):
-    """Rows in groups of `estimator.lanes.LANES`, each group with options of its own, seen as features.
+    """Rows in groups of `estimator.compilation.simd.LANES`, each group with options of its own, seen as features.
 
     A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
     theirs, are cut short. As in `agents.training.environments.feature_vec_env` the increase of what is still to come is added to the

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimator.ensemble import half_cauchy
 from estimator.identification.fitting.profile_likelihood import RidgePosterior, profile_posterior
 from estimator.identification.fitting.weak_form import input_effect_rms, random_starts, weak_form_starts
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
@@ -20,6 +19,7 @@ from estimator.identification.likelihood.laplace_fit import (
     LaplaceFitter,
     with_noise_ratios,
 )
+from estimator.inference.noise_grid import neg_log_half_cauchy
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.rig_prior import rig_prior
 from estimator.support.array_types import FloatArray
@@ -318,7 +318,7 @@ def _fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
             )
             samples *= _SEGMENT_GROWTH
         found.append(fits)
-    names = ("mean", "cov", "level", "free_energy", "loss")
+    names = ("mean", "cov", "sensor_std", "free_energy", "loss")
     both = (np.concatenate([getattr(fits, name) for fits in found]) for name in names)
     return _fit_from_initial_states(
         fitter, LaplaceFits(tuple(h for fits in found for h in fits.hypotheses), *both), ratios, _N_KEPT_STARTS[2]
@@ -395,7 +395,7 @@ def fit_noise_ratio(
                 "simulated record some noise, of 1e-8 of its size at least"
             )
         log_ratios_from_unit = logs - np.log(unit)
-        energies = fits.free_energy + half_cauchy(log_ratios_from_unit)
+        energies = fits.free_energy + neg_log_half_cauchy(log_ratios_from_unit)
         best = int(np.argmin(energies))
         initial_coefficients, sensor_std = fits.mean[best], float(fits.sensor_std[best])
         excess_energies = energies - energies[best]

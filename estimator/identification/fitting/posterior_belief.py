@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.belief import Belief
-from estimator.ensemble import matched_gamma
 from estimator.identification.fitting.multistart_search import SearchResult, fit_noise_ratio
 from estimator.identification.likelihood.identification_problem import IdentificationProblem, mask_unexplained_outputs
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import CoefficientPrior, FitHypothesis, LaplaceFitter
-from estimator.information import follow
+from estimator.inference.fisher_information import filter_records
+from estimator.inference.noise_grid import moment_matched_gamma
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import belief_from_moments
@@ -40,7 +40,9 @@ def posterior_belief(
     rig, scales = problem.rig, problem.scales
     belief = belief_from_moments(rig, scales, *problem.moments_about_zero(search_result.mean, search_result.cov))
     shapes = np.full(len(search_result.weights), problem.n_observed_outputs / 2)
-    gamma, xi = (matched_gamma(search_result.weights, shapes, shapes * noise**2) for noise in search_result.noises)
+    gamma, xi = (
+        moment_matched_gamma(search_result.weights, shapes, shapes * noise**2) for noise in search_result.noises
+    )
     belief = Belief.of(
         problem.belief_model, belief.mean, _with_initial_state_cov(belief, problem), gamma, xi, scales=scales
     )
@@ -93,7 +95,7 @@ def one_step_forecasts(
     noises = problem.noises_of_records(belief.noises[None, 1::2] / belief.noises[None, ::2])
     forecasts = np.empty((*outputs.shape, 2))
     points = np.tile(search_result.mean, (len(inputs), 1))
-    follow(
+    filter_records(
         problem.model,
         points,
         inputs,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.data.nonuniform_sampling import resample_on_knots
-from estimator.inputs import feed
+from estimator.inference.input_interpolation import input_stencil
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
 from estimator.models.model import Model
 from estimator.rigs.rig import INTERPOLATION_DEGREES, Channel, Rig
@@ -315,14 +315,14 @@ def mask_unexplained_outputs(y: FloatArray, rig: Rig, extra_delay: int = 0) -> F
 
 def filter_input_rows(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
     """(T, rows) what a model takes over the sample before each output; after the last input it stays the same."""
-    input_feed = feed(model, rig)
-    if input_feed.at_once:
-        return input_feed.pieces(u)
+    input_feed = input_stencil(model, rig)
+    if input_feed.needs_whole_record:
+        return input_feed.spline_coefficients(u)
     window = input_feed.stencil.shape[1]
-    lag = -1 if input_feed.waits else input_feed.past - (window - 1)
+    lag = -1 if input_feed.lookahead else input_feed.n_past - (window - 1)
     places = np.arange(len(u))[:, None] - lag - (window - 1) + np.arange(window)
     acting = u[np.clip(places, 0, len(u) - 1)]
-    if not input_feed.fills:
+    if not input_feed.repeats_first:
         acting = np.where(places < 0, 0.0, acting)
     return np.asarray(acting @ input_feed.stencil.T)
 

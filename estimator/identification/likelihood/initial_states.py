@@ -15,7 +15,7 @@ import numpy as np
 from estimator.identification.fitting.weak_form import well_displacements
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import FitHypothesis
-from estimator.information import follow
+from estimator.inference.fisher_information import filter_records
 from estimator.support.array_types import FloatArray
 
 #: A grid of so many displacements and velocities each, up to so much of the largest, is looked at first. What is judged
@@ -115,7 +115,7 @@ def _initial_state_loss(
     def losses(candidates: FloatArray, sensor: float) -> FloatArray:
         count, series = candidates.shape[:2]
         times = count * series // len(inputs)
-        loss = follow(
+        loss = filter_records(
             problem.model,
             np.tile(at, (count, 1)),
             np.tile(inputs, (times, 1, 1)),

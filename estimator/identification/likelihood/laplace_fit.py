@@ -6,7 +6,7 @@ coefficients ψ it is judged by the free energy of a Gaussian at the minimum (va
 
     L = ½ Σ_t (ν_t²/S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0),    F = L + ½ log det(Λ0 + I) - ½ log det Λ0,
 
-with the information I of `estimator.information`. The level of the noises is not searched: S grows with it as a whole,
+with the information I of `estimator.inference.fisher_information`. The level of the noises is not searched: S grows with it as a whole,
 so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (Σ log S + N log(Σ ν²/S / N) + N). The
 first outputs of a record, as many as there are states, do not count: any motion may have been before them.
 """
@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.likelihood.identification_problem import FilterSamples, IdentificationProblem
-from estimator.information import Followed, follow
+from estimator.inference.fisher_information import FilteredRecords, filter_records
 from estimator.support.array_types import FloatArray
 
 #: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
@@ -244,7 +244,7 @@ class LaplaceFitter:
     def record_noise_scales(self, hypothesis: FitHypothesis, coefficients: FloatArray, sensor_std: float) -> FloatArray:
         """(records,) the noises that each record shows at coefficients (K,), in parts of what they are on the whole."""
         filter_inputs, n_observed = self._filter_inputs([hypothesis]), [np.isfinite(y).sum() for y in self.problem.y]
-        misfits = self._run_filter(coefficients[None], filter_inputs, np.array([sensor_std])).misfit
+        misfits = self._run_filter(coefficients[None], filter_inputs, np.array([sensor_std])).innovations_squared
         known_scales = (
             np.ones(len(n_observed)) if self.problem.record_noise_scales is None else self.problem.record_noise_scales
         )
@@ -301,14 +301,14 @@ class LaplaceFitter:
             np.where(bad, sensor_stds, sensor_stds * np.sqrt(np.where(bad, 1.0, excess))),
         )
 
-    def _run_filter(self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray) -> Followed:
+    def _run_filter(self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray) -> FilteredRecords:
         """What the filter finds in all records at each of the points (H, K)."""
         problem, records, inputs = (
             self.problem,
             len(self.problem.u),
             filter_inputs.inputs[filter_inputs.input_path_index],
         )
-        return follow(
+        return filter_records(
             problem.model,
             np.repeat(points, records, axis=0),
             inputs.reshape(-1, *inputs.shape[2:]),

@@ -28,8 +28,8 @@ from agents.hardware.simulated_plant import SimulatedPlant
 from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies.signals import hold_for_resonance
 from estimator import Channel, OnlineEstimator, Rig, identify
-from estimator.free_run import free_run
 from estimator.identification.fitting.posterior_belief import refit_coefficients
+from estimator.inference.free_run import free_run
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 
@@ -347,7 +347,7 @@ def test_the_probability_of_leaving_grows_with_the_input():
     assert found[0] < 0.01
     assert found == sorted(found)
     assert found[-1] > 0.9
-    share, probability = futures.share(30.0 * u, 0.05)
+    share, probability = futures.safe_scale(30.0 * u, 0.05)
     assert 0.01 < share < 0.5
     assert probability < 0.05
 

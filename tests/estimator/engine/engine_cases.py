@@ -10,7 +10,7 @@ from reference.plants import DRAG as SIGNED_DRAG
 from reference.plants import VAN_DER_POL
 from reference.structured import Belief
 
-from estimator.engine.rows import input_rows
+from estimator.engine.storage_layout import input_rows
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model

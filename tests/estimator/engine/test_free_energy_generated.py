@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 from scipy.stats import norm
 from test_structured_generated import LANES, some_samples, updated
 
-from estimator.engine import tasks
-from estimator.engine.free_energy import free_energies
+from estimator.engine import kernels
+from estimator.engine.variational_free_energy import compile_free_energies
 
 ITERATIONS = 3
 
@@ -22,8 +22,10 @@ ITERATIONS = 3
 def test_free_energies_equal_their_definition(name):
     """Over one and over two sensors, of which only the first tells of the process noise."""
     case = CASES[name]
-    task = tasks.structured(case.model, case.degree, iterations=ITERATIONS, lanes=LANES, trace=True, missing=True)
-    free_energy = free_energies(case.model, ITERATIONS, LANES, task.layout)
+    task = kernels.compile_belief_update(
+        case.model, case.degree, iterations=ITERATIONS, lanes=LANES, keep_trace=True, may_be_missing=True
+    )
+    free_energy = compile_free_energies(case.model, ITERATIONS, LANES, task.layout)
     samples = some_samples(case, 3)
     samples[1][2][0] = np.nan
     samples[2][2][:] = np.nan
@@ -66,8 +68,8 @@ def test_the_reference_has_the_free_energy_of_the_joint_gaussian():
 def traced(iterations):
     """The update of the paper's equation, its free energies, and belief and sample after sample for it."""
     case = CASES["paper"]
-    task = tasks.structured(case.model, iterations=iterations, lanes=LANES, trace=True)
-    return case, task, free_energies(case.model, iterations, LANES, task.layout)
+    task = kernels.compile_belief_update(case.model, iterations=iterations, lanes=LANES, keep_trace=True)
+    return case, task, compile_free_energies(case.model, iterations, LANES, task.layout)
 
 
 def predicted(belief, u):

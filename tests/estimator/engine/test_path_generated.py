@@ -6,8 +6,8 @@ from engine_cases import CASES, FIVE, block, put, random_inputs
 from reference.filters import EPS, central, moved, path, spread
 from tables import table
 
-from estimator.engine import gradient, tasks
-from estimator.engine.rows import input_rows
+from estimator.engine import adjoint, kernels
+from estimator.engine.storage_layout import input_rows
 
 SAMPLES = 12
 #: Variances of unit process noise and of the sensors.
@@ -75,13 +75,15 @@ def walked(case, task, walks, observed):
 @pytest.mark.parametrize("name", CASES)
 def test_a_path_equals_its_equations(name, observed):
     case = CASES[name]
-    task = tasks.path(case.model, case.degree, observed=observed, lanes=1)
+    task = kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=observed, lanes=1)
     assert_equals_reference(case, task, observed)
 
 
 def test_a_compiled_path_equals_its_equations():
     case = CASES["pendulum"]
-    assert_equals_reference(case, tasks.path(case.model, case.degree, observed=True, lanes=4), True)
+    assert_equals_reference(
+        case, kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=True, lanes=4), True
+    )
 
 
 def assert_equals_reference(case, task, observed):
@@ -111,8 +113,8 @@ def assert_equals_reference(case, task, observed):
         total = SAMPLES * len(R) * (1 + abs(np.log(R.min())))
         assert at("LOSS") == pytest.approx(expected.loss, abs=enlarged * total)
         slope = np.array([at(f"SLOPE_{i}") for i in names])
-        assert (np.abs(slope - expected.slope) <= enlarged * size * np.sqrt(total)).all()
-        assert np.abs(expected.slope / size).max() > 0.1
+        assert (np.abs(slope - expected.gradient) <= enlarged * size * np.sqrt(total)).all()
+        assert np.abs(expected.gradient / size).max() > 0.1
     else:
         np.testing.assert_allclose(shown, expected.shown, rtol=tolerance, atol=tolerance)
 
@@ -122,7 +124,7 @@ def test_the_information_is_that_of_the_responses_slopes(name):
     """Without process noise and from a known state, F is the sum of slopes of what is shown, over r."""
     case = CASES[name]
     z, V, c, inputs, R, _ = some_walk(case, 2)
-    task = tasks.path(case.model, case.degree, observed=False, lanes=1)
+    task = kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=False, lanes=1)
     W = block(task.layout, 1)
     start(case, task.layout, z, 0 * V, c, (0.0, *R), W)
     for taps in inputs:
@@ -148,11 +150,11 @@ def test_the_information_is_that_of_the_responses_slopes(name):
 def pieces_of(case, name, monkeypatch):
     """The gradient's code: compiled for two equations, and as the plain Python that it is for the others."""
     if name in ("paper", "pendulum"):
-        return gradient.pieces(case.model, case.degree)
+        return adjoint.compile_adjoint(case.model, case.degree)
     with monkeypatch.context() as plain:
-        plain.setattr("estimator.engine.cache.part", lambda _: lambda function: function)
-        plain.setattr("estimator.engine.cache.straight_within", lambda _: lambda function: function)
-        return gradient.pieces.__wrapped__(case.model, case.degree)
+        plain.setattr("estimator.engine.source_cache.part", lambda _: lambda function: function)
+        plain.setattr("estimator.engine.source_cache.scalar_jit_from_source", lambda _: lambda function: function)
+        return adjoint.compile_adjoint.__wrapped__(case.model, case.degree)
 
 
 @pytest.mark.parametrize("name", [*FIVE, "drag"])
@@ -176,7 +178,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
         return np.array(P), np.array(F), np.array(seen)
 
     def laid(u, t):
-        return code.lay(*(u[t - k] if t >= k else 0.0 for k in range(3)))
+        return code.input_coefficients(*(u[t - k] if t >= k else 0.0 for k in range(3)))
 
     tape = np.empty((SAMPLES, code.n_tape))
     ends = forward(inputs, tape)
@@ -185,7 +187,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
     weights.append(rng.standard_normal(SAMPLES))
     G, found = tuple(weights[0]), np.zeros(SAMPLES + 2)
     for t in reversed(range(SAMPLES)):
-        G, *slopes = code.back(G, tuple(weights[1]), C, laid(inputs, t), N, weights[2][t], tape, t)
+        G, *slopes = code.backward(G, tuple(weights[1]), C, laid(inputs, t), N, weights[2][t], tape, t)
         found[t : t + 3] += slopes[::-1]  # of the inputs two samples before, one before, and now
     # Directions that share no input with one another: an error in any slope is one in the sum that it stands in.
     directions = np.arange(SAMPLES) % 3 == np.arange(3)[:, None]
@@ -204,7 +206,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
 
 def test_a_lane_that_is_over_counts_nothing():
     case = CASES["paper"]
-    task = tasks.path(case.model, case.degree, observed=True, lanes=1)
+    task = kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=True, lanes=1)
     z, V, c, inputs, R, y = some_walk(case, 5)
     W = block(task.layout, 1)
     start(case, task.layout, z, V, c, (NOISE, *R), W)

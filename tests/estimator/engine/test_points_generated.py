@@ -10,17 +10,19 @@ from reference.structured import update
 from tables import table
 from test_structured_generated import LANES, some_samples, updated
 
-from estimator.engine import tasks
-from estimator.engine.free_energy import free_energies
-from estimator.engine.points import ROUNDING
-from estimator.engine.rows import input_rows
+from estimator.engine import kernels
+from estimator.engine.cubature import PIVOT_TOLERANCE
+from estimator.engine.storage_layout import input_rows
+from estimator.engine.variational_free_energy import compile_free_energies
 from estimator.models.model import Model
 
 NAMES = ["duffing, all terms", "cubic", "pendulum", "wiener-hammerstein", "van der pol"]
 
 
 def generated(case):
-    return tasks.structured(case.model, case.degree, lanes=LANES, missing=True, expectations="sigma_points")
+    return kernels.compile_belief_update(
+        case.model, case.degree, lanes=LANES, may_be_missing=True, expectations="sigma_points"
+    )
 
 
 def movers(case):
@@ -50,12 +52,12 @@ def test_an_update_equals_its_equations(name):
 
 def test_free_energies_of_an_update_equal_their_definition():
     case = CASES["van der pol"]
-    task = tasks.structured(
-        case.model, case.degree, lanes=LANES, missing=True, trace=True, expectations="sigma_points"
+    task = kernels.compile_belief_update(
+        case.model, case.degree, lanes=LANES, may_be_missing=True, keep_trace=True, expectations="sigma_points"
     )  # fmt: skip
     samples = some_samples(case, 12)
     W, found = updated(case, task, samples), np.empty((3, LANES))
-    free_energies(case.model, 3, LANES, task.layout)(W, found.ravel())
+    compile_free_energies(case.model, 3, LANES, task.layout)(W, found.ravel())
     belief, inputs, y = samples[0]
     expected = update(case.plant, 2, belief, inputs, y, 3, movers(case)).free_energies[0]
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-9)
@@ -80,7 +82,7 @@ def test_a_belief_without_doubt_moves_with_its_mean():
     belief, inputs, _ = some_samples(case, 14)[0]
     sure = replace(belief, cov=np.zeros((5, 5)))
     W = updated(case, generated(case), [(sure, inputs, [np.nan, np.nan])] * LANES)
-    first = tasks.structured(case.model, case.degree, lanes=LANES, missing=True)
+    first = kernels.compile_belief_update(case.model, case.degree, lanes=LANES, may_be_missing=True)
     V = updated(case, first, [(sure, inputs, [np.nan, np.nan])] * LANES)
     ours, theirs = (get_belief(w, first.layout, LANES, 0, case) for w in (W, V))
     np.testing.assert_allclose(ours.mean, theirs.mean, rtol=EPS * case.operations)
@@ -112,7 +114,9 @@ def test_on_a_linear_model_it_is_first_order():
 def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
     """Beliefs, inputs and outputs over sixteen decades, sixty samples on end."""
     case = CASES[name]
-    task = tasks.structured(case.model, case.degree, lanes=LANES, missing=True, expectations="sigma_points")
+    task = kernels.compile_belief_update(
+        case.model, case.degree, lanes=LANES, may_be_missing=True, expectations="sigma_points"
+    )
     rng = np.random.default_rng(16)
     sound = flagged = 0
     for width in 10.0 ** np.arange(-12, 5):
@@ -127,7 +131,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
                 table[task.layout[row]] = width * rng.standard_normal(LANES)
             table[task.layout["Y_y"]] = width * rng.standard_normal(LANES)
             task.update(W)
-        task.check(W)
+        task.count_unsound(W)
         for lane in range(LANES):
             cov = get_belief(W, task.layout, LANES, lane, case).cov
             if table[task.layout["UNSOUND"], lane] > 0:
@@ -139,7 +143,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
             assert (cov[known] == 0).all()
             std[known] = 1.0
             # Pivots down to -ROUNDING, and what dead columns leave, √ROUNDING of two standard deviations.
-            assert np.linalg.eigvalsh(cov / np.outer(std, std))[0] >= -len(std) * np.sqrt(ROUNDING)
+            assert np.linalg.eigvalsh(cov / np.outer(std, std))[0] >= -len(std) * np.sqrt(PIVOT_TOLERANCE)
             sound += 1
     assert sound > 20
     assert sound + flagged == 17 * LANES
@@ -167,11 +171,11 @@ def test_what_is_no_covariance_is_flagged(entries, flagged):
     W = block(task.layout, LANES)
     for lane in range(LANES):
         put_belief(W, task.layout, LANES, lane, case, replace(belief, cov=cov if lane == 2 else np.eye(5)))
-    task.check(W)
+    task.count_unsound(W)
     counts = W.reshape(-1, LANES)[task.layout["UNSOUND"]]
     np.testing.assert_array_equal(counts > 0, [flagged and lane == 2 for lane in range(LANES)])
 
 
 def test_other_expectations_are_refused():
     with pytest.raises(ValueError, match=r"expectations must be one of .*, but is 'unscented'"):
-        tasks.structured(CASES["paper"].model, expectations="unscented")
+        kernels.compile_belief_update(CASES["paper"].model, expectations="unscented")

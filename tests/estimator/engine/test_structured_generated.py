@@ -9,8 +9,8 @@ from reference.filters import EPS, Plant
 from reference.structured import update
 from tables import table
 
-from estimator.engine import tasks
-from estimator.engine.rows import input_rows
+from estimator.engine import kernels
+from estimator.engine.storage_layout import input_rows
 from estimator.models.model import Model
 
 LANES = 8
@@ -48,7 +48,7 @@ def assert_equals_reference(case, task, samples, iterations):
 @pytest.mark.parametrize(("name", "iterations"), [*((name, 3) for name in CASES), ("paper", 1), ("pendulum", 1)])
 def test_an_update_equals_its_equations(name, iterations):
     case = CASES[name]
-    task = tasks.structured(case.model, case.degree, iterations=iterations, lanes=LANES)
+    task = kernels.compile_belief_update(case.model, case.degree, iterations=iterations, lanes=LANES)
     assert_equals_reference(case, task, some_samples(case, 1), iterations)
 
 
@@ -56,7 +56,7 @@ def test_an_update_equals_its_equations(name, iterations):
 def test_an_update_equals_its_equations_with_missing_outputs(name):
     """Of two sensors none, the first, the second or both are missing."""
     case = CASES[name]
-    task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
+    task = kernels.compile_belief_update(case.model, case.degree, iterations=2, lanes=LANES, may_be_missing=True)
     samples = some_samples(case, 2)
     for lane, (_, _, y) in enumerate(samples):
         y[[bool(lane & bit) for bit in (1, 2)][: len(y)]] = np.nan
@@ -66,7 +66,7 @@ def test_an_update_equals_its_equations_with_missing_outputs(name):
 def test_a_missing_output_leaves_the_belief_bit_by_bit_as_predicted():
     """And one that is there keeps the digits of its own variance, however much smaller than the predicted one it is."""
     case = CASES["paper"]
-    task = tasks.structured(case.model, lanes=LANES, missing=True)
+    task = kernels.compile_belief_update(case.model, lanes=LANES, may_be_missing=True)
     belief, inputs, y = some_samples(case, 6)[0]
     precise = replace(belief, gamma=(100.0, 100.0), xi=[(100.0, 1e-16)])
     W = updated(case, task, [(precise, inputs, y), (belief, inputs, [np.nan])] + [(belief, inputs, y)] * (LANES - 2))
@@ -86,7 +86,7 @@ def test_noise_that_no_sensor_shows_widens_the_state_and_is_not_learned():
     )
     plant = Plant(lambda z, c, u: [c[0] * z[0] + z[1], z[1] / 2], lambda z, c, u: [z[0]], lambda z, c: [0.0, 1.0])
     case = Case(hidden, plant, (0.5, 0.2, 0.9))
-    task = tasks.structured(hidden, lanes=LANES, trace=True)
+    task = kernels.compile_belief_update(hidden, lanes=LANES, keep_trace=True)
     samples = some_samples(case, 7)
     assert_equals_reference(case, task, samples, 3)
     W = updated(case, task, samples)
@@ -97,7 +97,7 @@ def test_noise_that_depends_on_the_state_may_vanish():
     growing = Model("growing", {"x": "1"}, {"k": "1"}, noise=("x",), outputs={"y": "x"}, next_state=("k*x + u",))
     plant = Plant(lambda z, c, u: [c[0] * z[0] + u[0]], lambda z, c, u: [z[0]], lambda z, c: [z[0]])
     case = Case(growing, plant, (0.5, 0.9))
-    task = tasks.structured(growing, lanes=LANES, trace=True)
+    task = kernels.compile_belief_update(growing, lanes=LANES, keep_trace=True)
     samples = some_samples(case, 8)
     assert_equals_reference(case, task, samples, 3)
     at_rest = replace(samples[0][0], mean=np.array([0.0, 0.9]))
@@ -119,7 +119,7 @@ def test_what_is_generated_names_nothing_twice():
         lambda z, c: [1.0, 0.0, 0.0], substeps=2,
     )  # fmt: skip
     case = Case(model, plant, (0.1, 0.2, 0.3, 0.4, 0.5))
-    task = tasks.structured(model, iterations=2, lanes=LANES)
+    task = kernels.compile_belief_update(model, iterations=2, lanes=LANES)
     assert_equals_reference(case, task, some_samples(case, 9), 2)
 
 
@@ -127,7 +127,7 @@ def test_what_is_generated_names_nothing_twice():
 def test_a_covariance_stays_one_whatever_the_samples(name, scale):
     """Samples that tell 1e18 times more than was known, and slopes that are too steep for the steps."""
     case = CASES[name]
-    task = tasks.structured(case.model, case.degree, lanes=LANES)
+    task = kernels.compile_belief_update(case.model, case.degree, lanes=LANES)
     rng = np.random.default_rng(11)
     whole = 0
     for size in scale ** rng.uniform(0.0, 1.0, 40):
@@ -150,7 +150,7 @@ def test_a_covariance_stays_one_whatever_the_samples(name, scale):
 
 def test_lanes_do_not_know_one_another():
     case = CASES["pendulum"]
-    task = tasks.structured(case.model, case.degree, iterations=2, lanes=LANES, missing=True)
+    task = kernels.compile_belief_update(case.model, case.degree, iterations=2, lanes=LANES, may_be_missing=True)
     samples = some_samples(case, 10)
     W = updated(case, task, samples).reshape(-1, LANES)
     alone = updated(case, task, samples[3:4] * LANES).reshape(-1, LANES)
@@ -160,4 +160,4 @@ def test_lanes_do_not_know_one_another():
 @table("iterations", [0, 101])
 def test_iterations_out_of_range_are_refused(iterations):
     with pytest.raises(ValueError, match=f"iterations must be a whole number from 1 to 100, but is {iterations}"):
-        tasks.structured(CASES["paper"].model, iterations=iterations)
+        kernels.compile_belief_update(CASES["paper"].model, iterations=iterations)

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.component_timing import NOISE, SAMPLES, EstimatorOnly, experiment_of, play
 from benchmarks.environments import TRACK, vector_steps
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference
-from estimator.lanes import LANES
+from estimator.compilation.simd import LANES
 
 
 @pytest.mark.parametrize(("factorisation", "iterations"), [("structured", 3), ("mean_field", 10)])

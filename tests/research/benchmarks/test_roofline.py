@@ -3,11 +3,11 @@
 import pytest
 
 from benchmarks.roofline import count, divide, move, multiply_add, pieces, take_root
-from estimator.lanes import lanewise, rows
+from estimator.compilation.simd import lanewise, number_rows
 
 
 def test_a_function_has_the_operations_that_one_counts_by_hand() -> None:
-    @lanewise(rows("a b c d"), "c d", uniform="x")
+    @lanewise(number_rows("a b c d"), "c d", uniform="x")
     def example(a, b, x):
         product = a * b + x
         return product / (a - b), product * product

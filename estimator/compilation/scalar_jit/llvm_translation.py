@@ -1,0 +1,362 @@
+"""From a syntax tree to the text of LLVM."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import hashlib
+import linecache
+import math
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, cached_property, reduce
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimator.compilation.scalar_jit.llvm_arithmetic import (
+    FMA_FLAG,
+    LLVM_TYPES,
+    LlvmArithmetic,
+    Scalar,
+    is_number,
+    is_tuple,
+)
+
+#: Kinds of arguments or results (`estimator.compilation.scalar_jit.llvm_arithmetic.Scalar`), and tuples of them.
+ArgumentTypes = tuple[Any, ...]
+
+
+class FunctionSource:
+    """A function's definition, and what its names stand for.
+
+    Args:
+        function: as Python defined it.
+        text: that was executed to define it; None where its file holds it.
+    """
+
+    def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
+        self.function = function
+        self.name = function.__qualname__
+        if text is None:
+            # The text as it is now, and not when it is compiled: the file may have changed then.
+            linecache.checkcache(function.__code__.co_filename)
+            text = "".join(linecache.getlines(function.__code__.co_filename))
+        self._text = text
+
+    @cached_property
+    def tree(self) -> ast.FunctionDef:
+        """The definition.
+
+        Raises:
+            TypeError: where the function's file does not hold it.
+        """
+        code = self.function.__code__
+        tree = _functions_by_line(self._text).get(code.co_firstlineno)
+        if tree is None or tree.name != self.function.__name__:
+            raise TypeError(f"{self.name} is not defined in {code.co_filename}; use straight_within its source")
+        return tree
+
+    @property
+    def arguments(self) -> list[str]:
+        """Names of the arguments."""
+        return list(self.function.__code__.co_varnames[: self.function.__code__.co_argcount])
+
+    def resolve(self, name: str) -> Any:
+        """What a name that is not local stands for.
+
+        Raises:
+            NameError: for one that stands for nothing, or for what a loop has assigned and forgotten.
+        """
+        free = self.function.__code__.co_freevars
+        if name in free:
+            return (self.function.__closure__ or ())[free.index(name)].cell_contents
+        if name in self.function.__code__.co_varnames or not (
+            name in self.function.__globals__ or hasattr(builtins, name)
+        ):
+            raise NameError(f"name {name!r} is not defined in {self.name}; assign it before, and not in a loop")
+        return self.function.__globals__.get(name, getattr(builtins, name, None))
+
+
+@cache
+def _functions_by_line(text: str) -> Mapping[int, ast.FunctionDef]:
+    """The definitions in a file's text, by their first lines."""
+    nodes = ast.walk(ast.parse(text))
+    found = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    return {min([node.lineno, *(d.lineno for d in node.decorator_list)]): node for node in found}
+
+
+class TranslatedFunction(NamedTuple):
+    """A function for arguments of certain kinds.
+
+    Attributes:
+        name: of its own in all compiled code: it holds a digest.
+        definitions: name to text, of the function and of those that it calls.
+        result: kinds that it returns; None where nothing.
+    """
+
+    name: str
+    definitions: Mapping[str, str]
+    result: Any
+
+
+#: Functions of one number, and what LLVM or the C library calls them.
+_FUNCTIONS: dict[Callable[..., Any], str] = {
+    math.sqrt: "llvm.sqrt.f64", np.sqrt: "llvm.sqrt.f64", math.floor: "llvm.floor.f64", abs: "llvm.fabs.f64",
+    math.exp: "llvm.exp.f64", math.log: "llvm.log.f64", math.log1p: "log1p",
+}  # fmt: skip
+
+#: What every text must declare.
+DECLARED_FUNCTIONS = tuple(sorted(set(_FUNCTIONS.values())))
+
+#: Doubles in a register of AVX-512; loops over the lanes of a block have a multiple of that as turns.
+VECTOR_WIDTH = 8
+
+#: Lines of such a loop up to which two turns go side by side. Of long ones processors' registers do not hold two.
+_MAX_INTERLEAVED_LINES = 340
+
+#: What marks them, and what their marks tell LLVM (`with_vector_metadata`).
+_LOOP_MARK, _LOOP_MARK_PATTERN = ", !llvm.loop !lanes_{}", re.compile(r", !llvm\.loop !lanes_(\d)")
+
+_CONVERSIONS: dict[Any, str] = {np.float64: "double", np.int64: "i64", np.uint64: "word"}
+
+
+def with_vector_metadata(text: str, has_avx512: bool) -> str:
+    """The text of a module whose loops over lanes use registers of AVX-512, where there are any.
+
+    LLVM by itself takes half of them on Intel's processors, for the sake of code that needs wide ones here and there.
+    Loops over lanes are little else, and take less time with them. Nor does it put turns side by side where each is
+    more than a few lines; but what waits for results of its own leaves time for another turn.
+    """
+    head, *rest = _LOOP_MARK_PATTERN.split(text)
+    if not rest or not has_avx512:
+        return head + "".join(rest[1::2])
+    numbers = range(1, 1 + len(rest) // 2)
+    marked = (f", !llvm.loop !{2 + i}{part}" for i, part in zip(numbers, rest[1::2], strict=True))
+    metadata = f'!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR_WIDTH}}}\n'
+    metadata += "".join(f'!{turns} = !{{!"llvm.loop.interleave.count", i32 {turns}}}\n' for turns in (1, 2))
+    loops = (f"!{2 + i} = distinct !{{!{2 + i}, !0, !{turns}}}\n" for i, turns in zip(numbers, rest[::2], strict=True))
+    return f"{head}{''.join(marked)}{metadata}{''.join(loops)}"
+
+
+def flat_types(nested_types: Any) -> list[str]:
+    """The kinds in tuples of kinds, in order; none of None."""
+    if nested_types is None:
+        return []
+    return (
+        [leaf for kind in nested_types for leaf in flat_types(kind)]
+        if isinstance(nested_types, tuple)
+        else [nested_types]
+    )
+
+
+class FunctionTranslation(LlvmArithmetic):
+    """The text of one function.
+
+    Args:
+        source: of the function.
+    """
+
+    def __init__(self, source: FunctionSource) -> None:
+        super().__init__(source.name)
+        self.source = source
+        self._block = "entry"
+        self._called: dict[str, str] = {}
+
+    def function(self, argument_types: ArgumentTypes) -> TranslatedFunction:
+        """The function for arguments of these kinds."""
+        arguments: list[Scalar] = []
+
+        def argument(kind: Any) -> Any:
+            if isinstance(kind, tuple):
+                return tuple(map(argument, kind))
+            arguments.append(Scalar(kind, f"%a{len(arguments)}"))
+            return arguments[-1]
+
+        returned = self._inline(self.source, [argument(kind) for kind in argument_types])
+        values = [] if returned is None else self.flatten(returned)
+        type_ = "{ " + ", ".join(LLVM_TYPES[value.llvm_type] for value in values) + " }" if values else "void"
+        returned_struct = "undef"
+        for i, value in enumerate(values):
+            self.lines.append(
+                f"%r{i} = insertvalue {type_} {returned_struct}, {LLVM_TYPES[value.llvm_type]} {value.text}, {i}"
+            )
+            returned_struct = f"%r{i}"
+        self.lines.append(f"ret {type_} {returned_struct}" if values else "ret void")
+        parameters = ", ".join(f"{LLVM_TYPES[a.llvm_type]} {a.text}" for a in arguments)
+        # What has no block is called in the midst of arithmetic; what has one stays a function of its own.
+        inline = "" if "ptr" in argument_types else " alwaysinline"
+        body = f"({parameters}){inline} {{\nentry:\n" + "\n".join(self.lines) + "\n}\n"
+        # All that a function depends on stands in its body, or in the names of those that it calls.
+        name = f"{self.source.function.__name__}.{hashlib.sha256(f'{type_}{body}'.encode()).hexdigest()[:16]}"
+        result = None if returned is None else self.types_of(returned)
+        return TranslatedFunction(name, {**self._called, name: f"define linkonce_odr {type_} @{name}{body}"}, result)
+
+    def _inline(self, source: FunctionSource, arguments: Sequence[Any]) -> Any:
+        """Write a function's lines here; what it returns."""
+        if len(arguments) != len(source.arguments):
+            raise TypeError(
+                f"{source.name} takes {source.arguments}, but is given {len(arguments)} arguments; give all"
+            )
+        outer, self.source, self.name = self.source, source, source.name
+        returned = self._statements(source.tree.body, dict(zip(source.arguments, arguments, strict=True)))
+        self.source, self.name = outer, outer.name
+        return returned
+
+    def _statements(self, body: Iterable[ast.stmt], names: dict[str, Any]) -> Any:
+        """Write statements; what they return."""
+        for statement in body:
+            match statement:
+                case ast.Return(value=None):
+                    return None
+                case ast.Return():
+                    return self._value(statement.value, names)
+                case ast.Assign(targets=[target]):
+                    self._assign(target, self._value(statement.value, names), names)
+                case ast.AugAssign():
+                    before, by = self._value(statement.target, names), self._value(statement.value, names)
+                    self._assign(statement.target, self.binary(statement.op, before, by), names)
+                case ast.For():
+                    self._loop(statement, names)
+                case ast.Expr():
+                    self._value(statement.value, names)
+                case _:
+                    raise self._error(statement, "stands in no straight function")
+        return None
+
+    def _assign(self, target: ast.expr, value: Any, names: dict[str, Any]) -> None:
+        """Give a name, the parts of a tuple, or the entry of a block its value."""
+        match target:
+            case ast.Name():
+                names[target.id] = value
+            case ast.Tuple():
+                for part, entry in zip(target.elts, value, strict=True):
+                    self._assign(part, entry, names)
+            case ast.Subscript():
+                address = self._address(target, names)
+                self.lines.append(f"store double {self.double(value)}, ptr {address}, align 8")
+            case _:
+                raise self._error(target, "cannot be assigned")
+
+    def _loop(self, loop: ast.For, names: dict[str, Any]) -> None:
+        """Write a loop; what it assigns is forgotten after each turn."""
+        match loop.target, loop.iter, loop.orelse:
+            case ast.Name() as target, ast.Call(func=function, args=[turns], keywords=[]), []:
+                is_range = self._value(function, names) is range
+            case _:
+                is_range = False
+        if not is_range or any(isinstance(node, ast.Return) for node in ast.walk(loop)):
+            raise self._error(loop.iter, "is no plain loop over range(n)")
+        count = self._value(turns, names)
+        if target.id in names or (is_number(count) and count < 1):
+            raise self._error(loop.iter, f"must have a turn, and a new name instead of {target.id}")
+        end = self.integer(count)
+        self.count += 1
+        n, before, at = self.count, self._block, len(self.lines)
+        self.lines += [f"br label %loop{n}", f"loop{n}:", ""]
+        self._block = f"loop{n}"
+        within = {**names, target.id: Scalar("i64", f"%i{n}")}
+        self._statements(loop.body, within)
+        kept = [name for name in names if name != target.id and within[name] is not names[name]]
+        if kept:
+            raise self._error(loop.iter, f"keeps {kept}, which must go into a block")
+        self.lines[at + 2] = f"%i{n} = phi i64 [ 0, %{before} ], [ %n{n}, %{self._block} ]"
+        self.lines += [f"%n{n} = add nsw i64 %i{n}, 1", f"%c{n} = icmp slt i64 %n{n}, {end}"]
+        calls = any("call void" in line for line in self.lines[at:])
+        is_of_lanes = is_number(count) and count % VECTOR_WIDTH == 0 and not calls
+        marked = _LOOP_MARK.format(2 if len(self.lines) - at < _MAX_INTERLEAVED_LINES else 1) if is_of_lanes else ""
+        self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}{marked}", f"done{n}:"]
+        self._block = f"done{n}"
+
+    def _value(self, node: Any, names: Mapping[str, Any]) -> Any:
+        """The value of an expression: a `Scalar`, a number, a tuple, or what a name stands for."""
+        match node:
+            case ast.Constant():
+                return node.value
+            case ast.Name():
+                return names[node.id] if node.id in names else self.source.resolve(node.id)
+            case ast.Attribute():
+                base = self._value(node.value, names)
+                if isinstance(base, Scalar):
+                    raise self._error(node, "asks a number or a block for an attribute")
+                return getattr(base, node.attr)
+            case ast.Tuple():
+                return tuple(self._value(entry, names) for entry in node.elts)
+            case ast.Subscript():
+                base = self._value(node.value, names)
+                if is_tuple(base):
+                    return base[self._value(node.slice, names)]
+                return self.op("double", f"load double, ptr {self._address(node, names)}, align 8")
+            case ast.UnaryOp():
+                return self.unary(node.op, self._value(node.operand, names))
+            case ast.BinOp():
+                return self.binary(node.op, self._value(node.left, names), self._value(node.right, names))
+            case ast.BoolOp():
+                word = "and" if isinstance(node.op, ast.And) else "or"
+                parts = [Scalar("i1", self.truth(self._value(part, names))) for part in node.values]
+                return reduce(lambda a, b: self.op("i1", f"{word} i1 {a.text}, {b.text}"), parts)
+            case ast.Compare(ops=[order], comparators=[right]):
+                return self.compare(type(order), self._value(node.left, names), self._value(right, names))
+            case ast.IfExp():
+                truth = self._value(node.test, names)
+                if is_number(truth):
+                    return self._value(node.body if truth else node.orelse, names)
+                return self.select(self.truth(truth), self._value(node.body, names), self._value(node.orelse, names))
+            case ast.Call():
+                return self._call(node, names)
+        raise self._error(node, "stands in no straight function")
+
+    def _address(self, node: ast.Subscript, names: Mapping[str, Any]) -> str:
+        """Where the entry of a block lies."""
+        base = self._value(node.value, names)
+        if not (isinstance(base, Scalar) and base.llvm_type == "ptr"):
+            raise self._error(node, "is no entry of a block")
+        at = self._value(node.slice, names)
+        if is_number(at) and at < 0:
+            raise self._error(node, "counts from the end")
+        index = self.integer(at)
+        return self.op("ptr", f"getelementptr inbounds double, ptr {base.text}, i64 {index}").text
+
+    def _call(self, node: ast.Call, names: Mapping[str, Any]) -> Any:
+        """The value of a call."""
+        if node.keywords:
+            raise self._error(node, "gives arguments by name")
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
+            value, kind = self._value(node.func.value, names), _CONVERSIONS.get(self._value(node.args[0], names))
+            if not isinstance(value, Scalar) or kind is None or value.llvm_type in ("i1", "ptr"):
+                raise self._error(node, "views something else than the bits of a number")
+            return self.op(kind, f"bitcast {LLVM_TYPES[value.llvm_type]} {value.text} to {LLVM_TYPES[kind]}")
+        function, operands = self._value(node.func, names), [self._value(argument, names) for argument in node.args]
+        source = getattr(function, "source", None)
+        if isinstance(source, FunctionSource):
+            if any(isinstance(value, Scalar) and value.llvm_type == "ptr" for value in operands):
+                return self._call_on_block(function, operands)
+            return self._inline(source, operands)
+        if function in (min, max) and len(operands) > 1:
+            order = ast.Lt if function is min else ast.Gt
+            return reduce(lambda a, b: self.select(self.compare(order, b, a).text, b, a), operands)
+        if function in _CONVERSIONS and len(operands) == 1:
+            return self.convert(_CONVERSIONS[function], operands[0])
+        if function in _FUNCTIONS and len(operands) == 1:
+            return self.op(
+                "double", f"call {FMA_FLAG} double @{_FUNCTIONS[function]}(double {self.double(operands[0])})"
+            )
+        raise self._error(node, "calls what is not straight")
+
+    def _call_on_block(self, function: Any, operands: Sequence[Any]) -> None:
+        """Call a function of blocks, which is one of its own for LLVM too, and leaves its results in them."""
+        values = tuple(self.scalar(value) if is_number(value) else value for value in operands)
+        called = function.translate(self.types_of(values))
+        if called.result is not None:
+            raise TypeError(
+                f"{self.name} calls {function.__name__}, which returns something; let it write into a block"
+            )
+        self._called |= called.definitions
+        flat = ", ".join(f"{LLVM_TYPES[value.llvm_type]} {value.text}" for value in self.flatten(values))
+        self.lines.append(f"call void @{called.name}({flat})")
+
+    def _error(self, node: ast.AST, what: str) -> TypeError:
+        """That a function is not straight."""
+        text = textwrap.shorten(ast.unparse(node), 60)
+        return TypeError(f"{text!r} in {self.name} {what}; compile it with jit instead")

@@ -1,0 +1,105 @@
+"""Paths of many systems and their reverse, for the gradient of what they tell together: in lanes, over many samples.
+
+The arithmetic is that of `estimator.engine.adjoint`, whose one system is in registers. Here as many systems as there
+are lanes follow the same inputs, each with coefficients, noises and a start of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from estimator.compilation.simd import LANES
+from estimator.engine import source_cache as stored
+from estimator.engine.adjoint import with_reverse
+from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, linearised_filter_layout
+from estimator.models.model import Model
+
+
+@dataclass(frozen=True)
+class LaneAdjoint:
+    """Compiled functions of blocks ``W`` and ``A`` of the same layout; ``A`` holds the adjoints of the rows of ``W``.
+
+    A tape (T, n_tape) keeps what samples begin with.
+
+    Attributes:
+        forward: ``forward(W, tape, t)``: sample t of every lane.
+        backward: ``backward(W, A, tape, t)``: the reverse of sample t, whose input is in ``W``. In ``A`` the path's rows have
+            the adjoints after it, and receive those before it; the information's rows and what the first sensor shows
+            have theirs; the rows of the input receive theirs.
+        layout: rows of a block, as `estimator.engine.kernels.LinearisedFilter` has them.
+        n_tape: numbers of one sample on the tape.
+    """
+
+    forward: Any
+    backward: Any
+    layout: Mapping[str, int]
+    n_tape: int
+
+
+@cache
+def compile_lane_adjoint(model: Model, degree: int = 0) -> LaneAdjoint:
+    """The paths of a model, along the response without noise; ``degree`` as in `estimator.engine.adjoint.compile_adjoint`."""
+    place = linearised_filter_layout(model, degree, follows_outputs=False)
+    key = repr((model.digest, degree))
+    code = stored.load_generated(
+        model.name, "gradient-lanes", key, lambda: _source(model, degree, place), RUNTIME_FUNCTIONS
+    )
+    return LaneAdjoint(code.forward, code.backward, place, code.n_tape)
+
+
+def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
+    from estimator.engine import printer_numba, symbolic, variational_rk4
+    from estimator.engine.linearised_filter import linearised_filter_step
+
+    path_rows, integrated, inputs = filter_state_rows(model), integrator_rows(model), input_rows(model, degree)
+    lines, propagation = symbolic.propagate_sample(model)
+    more, results = linearised_filter_step(model, propagation, degree, follows_outputs=False)
+    lines = [*lines, *more]
+    shown = f"SHOWN_{next(iter(model.outputs))}"
+    source = printer_numba.print_lane_loop("finish", lines, results, layout, LANES, doc="Predict and see.")
+    information_rows = [row for row in results if row.startswith("F_")]
+    followed = {row: results[row] for row in (*path_rows, *information_rows, shown) if row in results}
+    wanted = [*path_rows, *integrated, *inputs]
+    back, adjoints = with_reverse(lines, followed, wanted)
+    source += printer_numba.print_lane_loop("finish_back", back, adjoints, layout, LANES, doc="The reverse derivative.")
+    n, m, steps = len(path_rows), len(integrated), model.substeps
+    if integrated:
+        source += variational_rk4.print_integrator(model, degree, layout, LANES)
+        step, ends = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_E" for name in integrated}
+        back, adjoints = with_reverse(step, ends, [*integrated, *inputs], inputs)
+        source += printer_numba.print_lane_loop(
+            "move_back", back, adjoints, layout, LANES, ("T",), "The reverse of a step."
+        )
+        started = {f"G_{i}": f"G_M_{i}" for i in model.states}
+        source += printer_numba.print_lane_loop("begin_back", [], started, layout, LANES, doc="The reverse of begin.")
+    return source + _sample_source(n * LANES, m * LANES, layout[integrated[0]] * LANES if integrated else 0, steps)
+
+
+def _sample_source(n_filter_state: int, n_integrated: int, first_integrated: int, steps: int) -> str:
+    """Source of a whole sample, forward and back: so many numbers of the path, so many carried ones, and where."""
+    source = (
+        f"n_tape = {n_filter_state + (steps + 1) * n_integrated if n_integrated else n_filter_state}\n"
+        "@jit\ndef keep(W, first, tape, t, place, count):\n"
+        "    for i in range(count):\n        tape[t, place + i] = W[first + i]\n"
+        "@jit\ndef lay(W, first, tape, t, place, count):\n"
+        "    for i in range(count):\n        W[first + i] = tape[t, place + i]\n"
+    )
+    if not n_integrated:
+        return source + (
+            f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    finish(W)\n"
+            f"@jit\ndef backward(W, A, tape, t):\n    lay(W, 0, tape, t, 0, {n_filter_state})\n    finish_back(W, A)\n"
+        )
+    return source + (
+        f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    begin(W)\n"
+        f"    for s in range({steps}):\n        keep(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
+        f"        move(W, s / {steps})\n"
+        f"    keep(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish(W)\n"
+        f"@jit\ndef backward(W, A, tape, t):\n    lay(W, 0, tape, t, 0, {n_filter_state})\n"
+        f"    lay(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish_back(W, A)\n"
+        f"    for s in range({steps - 1}, -1, -1):\n        lay(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
+        f"        move_back(W, A, s / {steps})\n    begin_back(W, A)\n"
+    )

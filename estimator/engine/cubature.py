@@ -1,0 +1,128 @@
+"""Sigma points, as assignments: a belief's motion by the cubature rule of degree 3.
+
+(Arasaratnam and Haykin 2009, doi:10.1109/TAC.2009.2019800; an unscented transform whose centre has no weight.)
+
+The points lie along the columns of √pairs L, L Lᵀ = P over the *movers*, the quantities on which the motion depends;
+the other rows of L say how the rest goes along. A mover of variance 0, or one that depends on those before it, leaves a
+column of zeros without weight: all lanes run through all columns, each with the weights that it has. Rows:
+
+============  ======================================================================================
+``L_c_i``     column c of √pairs L at quantity i
+``WEIGHT_c``  of each of the two points along column c
+``X_i``       coefficient i at the point that moves; its state is in ``M_i``
+``I_p_i``     state i after the motion, at point p: 2 c in the direction of column c, 2 c + 1 against it
+``UNSOUND``   how often a covariance was not positive semi-definite, since it was last set to 0
+============  ======================================================================================
+"""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from estimator.engine import symbolic
+from estimator.engine.gaussian_update import HALF, ONE, ZERO, select
+from estimator.engine.storage_layout import cubature_order
+from estimator.engine.symbolic import Assignments, Propagation, differentiate, substitute, symbol, symmetric_entry
+from estimator.models.model import Model
+
+#: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
+PIVOT_TOLERANCE = 1e-14
+
+#: 1 for what is negative or no number, else 0.
+is_negative = sp.Function("below")
+
+
+def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
+    """The columns of √pairs L and their weights, and whether P is a covariance: assignments and results by row.
+
+    A column is dead where its pivot is within `PIVOT_TOLERANCE` of the variance. P is not a covariance where a pivot is
+    below that, or a dead column still goes along with another quantity.
+    """
+    names, m = cubature_order(model), len(model.movers)
+    covariance = lambda i, j: symmetric_entry("P", i, j, model.names)  # noqa: E731
+    lines: Assignments = []
+
+    def assign(name: str, expression: sp.Expr) -> sp.Expr:
+        lines.append((name, expression))
+        return symbol(name)
+
+    factor: dict[tuple[int, str], sp.Symbol] = {}
+    active, faults = [], []
+    for c, j in enumerate(names):
+        variance = covariance(j, j)
+        tolerance = assign(f"MARGIN_{c}", PIVOT_TOLERANCE * variance)
+        pivot = assign(f"PIVOT_{c}", variance - sum((factor[d, j] ** 2 for d in range(c)), ZERO))
+        is_active = assign(f"LIVES_{c}", select(pivot - tolerance, ONE, ZERO))
+        inverse = assign(f"INVERSE_{c}", is_active / sp.sqrt(select(is_active, pivot, ONE)))
+        faults.append(is_negative(pivot + tolerance))
+        factor[c, j] = assign(f"FACTOR_{c}_{j}", pivot * inverse)
+        for i in names[c + 1 :]:
+            rest = covariance(i, j) - sum((factor[d, i] * factor[d, j] for d in range(c)), ZERO)
+            rest = assign(f"REST_{c}_{i}", rest)
+            factor[c, i] = assign(f"FACTOR_{c}_{i}", rest * inverse)
+            faults.append(is_negative(tolerance * covariance(i, i) - (ONE - is_active) * rest**2))
+        active.append(is_active)
+    n_active = assign("PAIRS", sum(active[:m], ZERO))
+    radius = assign("WIDTH", sp.sqrt(select(n_active, n_active, ONE)))
+    point_weight = assign("EACH", HALF / select(n_active, n_active, ONE))
+    results = {}
+    for c in range(m):
+        # Where everything is known, two points at the mean move with it.
+        weight = point_weight * active[c] if c else point_weight * select(n_active, active[0], ONE)
+        results[f"WEIGHT_{c}"] = str(assign(f"WEIGHT_{c}_e", weight))
+        for i in names[:c]:
+            results[f"L_{c}_{i}"] = "0.0"
+        for i in names[c:]:
+            results[f"L_{c}_{i}"] = str(assign(f"WIDE_{c}_{i}", radius * factor[c, i]))
+    results["UNSOUND"] = str(assign("UNSOUND_e", symbol("UNSOUND") + sum(faults, ZERO)))
+    return lines, results
+
+
+def point_names(model: Model) -> dict[str, str]:
+    """Names of the movers at a point."""
+    return {i: f"M_{i}" if i in model.states else f"X_{i}" for i in model.movers}
+
+
+def place_point(model: Model) -> tuple[Assignments, dict[str, str]]:
+    """The point at ``SIGN`` times the column ``L_C`` from the mean."""
+    lines = [(f"{to}_e", symbol(i) + symbol("SIGN") * symbol(f"L_C_{i}")) for i, to in point_names(model).items()]
+    return lines, {to: f"{to}_e" for to in point_names(model).values()}
+
+
+def propagate_point(model: Model, degree: int) -> Assignments:
+    """One Runge-Kutta step of a point."""
+    coefficients = {i: to for i, to in point_names(model).items() if i not in model.states}
+    return substitute(symbolic.state_rk4_step(model, degree), coefficients)
+
+
+def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str]]:
+    """A whole sample of a difference equation, from the point at ``SIGN`` times ``L_C`` to its image ``I_P``."""
+    lines, _ = place_point(model)
+    named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
+    inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
+    lines += substitute(named.items(), inputs | {i: f"{to}_e" for i, to in point_names(model).items()})
+    return lines, {f"I_P_{i}": f"NEXT_{i}" for i in model.states}
+
+
+def point_moments(model: Model) -> tuple[Assignments, Propagation]:
+    """Mean and covariance Q of the images, without process noise, whose covariance is that at the mean."""
+    states, m = list(model.states), len(model.movers)
+    lines: Assignments = []
+    weight = [symbol(f"WEIGHT_{c}") for c in range(m)]
+    image = lambda p, i: symbol(f"I_{p}_{i}")  # noqa: E731
+    for i in states:
+        lines.append(
+            (f"MIDDLE_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO))
+        )
+        lines += [(f"OFF_{p}_{i}", image(p, i) - symbol(f"MIDDLE_{i}")) for p in range(2 * m)]
+        lines += [(f"LEAN_{c}_{i}", weight[c] * (image(2 * c, i) - image(2 * c + 1, i))) for c in range(m)]
+    deviation = lambda p, i: symbol(f"OFF_{p}_{i}")  # noqa: E731
+    for a, i in enumerate(states):
+        for k in states[a:]:
+            total = sum((weight[p // 2] * deviation(p, i) * deviation(p, k) for p in range(2 * m)), ZERO)
+            lines.append((f"Q_{i}_{k}", total))
+        for j in model.coefficients:
+            total = sum((symbol(f"LEAN_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
+            lines.append((f"Q_{i}_{j}", total))
+    at_mean = symbolic.propagate_sample(model)[1]
+    return lines, Propagation(tuple(symbol(f"MIDDLE_{i}") for i in states), (), at_mean.noise_cov, at_mean.is_psd)

@@ -1,0 +1,389 @@
+"""The packed algebra of a filter, as assignments: what a sample does to a joint Gaussian, or to a path.
+
+With M, S, N of a sample (`estimator.engine.symbolic`) the joint covariance P of states and coefficients is predicted by
+Q = S P Sᵀ, and sensors are taken one after another: with h the derivative of what a sensor shows,
+
+    c = Q h,   s = hᵀ Q h,   e = y - prediction,   q = hᵀ N h / E[γ],   r = 1/E[ξ],
+
+for fixed E[γ], E[ξ] a Kalman step; minimising the free energy over q(γ) and q(ξ) needs the moments of both noises under
+that step's posterior, which depend on scalars only:
+
+    E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
+
+γ is learned from the first sensor that shows the process noise of the same sample; where none does, γ stays.
+
+Where a sample says 10⁸ times more than was known, rounding may leave a matrix that is not positive semi-definite.
+So every variance takes along what rounding may have changed it by, `ROUNDING` of what it is the difference of: the
+rounded matrix is the exact one and an error E, |E_ij| ≤ a_i a_j ROUNDING/d, to which ROUNDING diag(a²) is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import sympy as sp
+
+from estimator.engine.printer_numba import print_expression
+from estimator.engine.symbolic import (
+    Assignments,
+    Program,
+    Propagation,
+    differentiate,
+    input_at_end,
+    symbol,
+    symmetric_entry,
+)
+from estimator.models.model import Model
+
+ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
+
+#: What rounding may change a variance by, in parts of its terms: 64 times 2⁻⁵³, for sums of d² = 36 or so products.
+ROUNDING = 2.0**-47
+
+#: 1 where a number is there and 0 where it is NaN; and the second of three where the first is positive, else the third.
+is_present, select = sp.Function("present"), sp.Function("select")
+
+#: A number, or 0 where it is negative; and the first of three, or whichever of the others it lies beyond. NaN stays.
+positive_part, clip = sp.Function("rectified"), sp.Function("clip")
+
+
+class GaussianUpdate:
+    """The predicted joint Gaussian, while sensors are taken: symbols or expressions of its mean and covariance.
+
+    Args:
+        model: whose quantities.
+        propagation: the motion over the sample.
+    """
+
+    def __init__(self, model: Model, propagation: Propagation) -> None:
+        self.model, self.propagation = model, propagation
+        self.names, self.states = list(model.names), list(model.states)
+        self.lines = Program()
+        self.assign = self.lines.assign
+        if not propagation.is_psd:
+            self.propagation = replace(propagation, noise_cov=self._project_to_psd(propagation.noise_cov))
+        self.mean: dict[str, sp.Expr] = {
+            **dict(zip(self.states, propagation.state, strict=True)),
+            **{c: symbol(c) for c in model.coefficients},
+        }
+        self.cov: dict[tuple[str, str], sp.Expr] = {}
+        self.transition_cov: dict[str, dict[str, sp.Expr]] = {}  # rows of S P
+        self._predict()
+
+    def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
+        i, j = key
+        return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
+
+    def _project_to_psd(self, noise_cov: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
+        """N where it is positive semi-definite; else its variances, with covariances cut to what they allow.
+
+        N is integrated by steps that are too long for slopes of more than about 3 a step, and may then be anything.
+        """
+        n = len(noise_cov)
+        entries = {(a, b): noise_cov[a][b] for a in range(n) for b in range(a, n)}
+        for a in range(n):
+            entries[a, a] = self.assign(f"SOUND_{a}_{a}", positive_part(entries[a, a]))
+        remaining = dict(entries)  # what those before leave of it
+        for a in range(n - 1):
+            for b in range(a + 1, n):
+                largest = self.assign(
+                    f"LARGEST_{a}_{b}",
+                    sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b])),
+                )
+                clipped = self.assign(f"KEPT_{a}_{b}", clip(remaining[a, b], -largest, largest))
+                entries[a, b] = (
+                    self.assign(f"SOUND_{a}_{b}", entries[a, b] + (clipped - remaining[a, b])) if a else clipped
+                )
+                remaining[a, b] = clipped
+            inverse = (
+                self.assign(f"INVERSE_{a}", 1 / select(remaining[a, a], remaining[a, a], ONE)) if a < n - 2 else ZERO
+            )
+            for b in range(a + 1, n if a < n - 2 else 0):
+                for c in range(b, n):
+                    remaining[b, c] = self.assign(
+                        f"REST_{a}_{b}_{c}", remaining[b, c] - remaining[a, b] * remaining[a, c] * inverse
+                    )
+        return tuple(tuple(entries[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
+
+    def _predict(self) -> None:
+        """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
+        names, jacobian, rows = self.names, self.propagation.jacobian, self.transition_cov
+        for a, i in enumerate(names):
+            for j in names[a:]:
+                self.cov[i, j] = symmetric_entry("P" if i not in self.states else "Q", i, j, names)
+        if not jacobian:
+            return
+        for i, slopes in zip(self.states, jacobian, strict=True):
+            row = {}
+            for j in names:
+                total = sum((a * symmetric_entry("P", k, j, names) for k, a in zip(names, slopes, strict=True)), ZERO)
+                row[j] = self.assign(f"B_{i}_{j}", total)
+            rows[i] = row
+        n = len(self.states)
+        for a, i in enumerate(self.states):
+            for b in range(a, n):
+                total = sum((s * rows[i][k] for k, s in zip(names, jacobian[b], strict=True)), ZERO)
+                if a == b and not total.is_Symbol:
+                    terms = (s**2 * symmetric_entry("P", k, k, names) for k, s in zip(names, jacobian[b], strict=True))
+                    total += ROUNDING * sum(terms, ZERO)
+                self.cov[i, self.states[b]] = self.assign(f"Q_{i}_{self.states[b]}", total)
+            for j in names[n:]:
+                self.cov[i, j] = rows[i][j]
+
+    def predicted_output(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
+        """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
+        c = differentiate(self.model)
+        at = {symbol(name): value for name, value in self.mean.items()} | {
+            symbol("u"): input_at_end(self.model, degree)
+        }
+        return c.outputs[sensor].xreplace(at), [slope.xreplace(at) for slope in c.output_slopes[sensor]]
+
+    def pending_output_variance(self, output_slope: Sequence[sp.Expr], sensor_variance: sp.Expr) -> sp.Expr:
+        """Variance by which the output of the sample before, not seen yet, moves what a sensor is expected to show.
+
+        With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): its gain is P h / r, and its own variance
+        r² / (r - hᵀ P h). That is kept above 0, since the P of a belief may be more than an output leaves.
+        """
+        h = {i: slope for i, slope in zip(self.names, output_slope, strict=True) if slope != 0}
+        before = {(i, j): symmetric_entry("P", i, j, self.names) for i in h for j in h}
+        shift = sum(
+            (
+                h[i] * h[j] * (self.transition_cov[i][j] if i in self.transition_cov else before[i, j])
+                for i, j in before
+            ),
+            ZERO,
+        )
+        remaining = self.assign(
+            "LEFT", sensor_variance - sum((h[i] * h[j] * known for (i, j), known in before.items()), ZERO)
+        )
+        smallest = self.assign("LITTLE", ROUNDING * sensor_variance)
+        return self.assign("TAKEN", shift) ** 2 / self.assign(
+            "LEAST", select(remaining - smallest, remaining, smallest)
+        )
+
+    def output_process_noise(self, output_slope: Sequence[sp.Expr]) -> sp.Expr:
+        """hᵀ N h: the variance that unit process noise has in a sensor."""
+        n = len(self.states)
+        total = sum(
+            (output_slope[a] * output_slope[b] * self.propagation.noise_cov[a][b] for a in range(n) for b in range(n)),
+            ZERO,
+        )
+        return sp.expand(total) if not total.free_symbols else total
+
+    def innovation_covariance(self, output_slope: Sequence[sp.Expr], tag: str) -> tuple[dict[str, sp.Expr], sp.Expr]:
+        """C = Q h and s = hᵀ c."""
+        cross_cov = {}
+        for i in self.names:
+            total = sum((h * self[i, j] for j, h in zip(self.names, output_slope, strict=True)), ZERO)
+            cross_cov[i] = self.assign(f"C{tag}_{i}", total)
+        s = sum((h * cross_cov[i] for i, h in zip(self.names, output_slope, strict=True)), ZERO)
+        return cross_cov, self.assign(f"S{tag}", s)
+
+    def add_process_noise(self, process_variance: sp.Expr) -> None:
+        """Q + N strength, of the states."""
+        for a, i in enumerate(self.states):
+            for b in range(a, len(self.states)):
+                k, unit_noise = self.states[b], self.propagation.noise_cov[a][b]
+                if unit_noise != 0:
+                    self.cov[i, k] = self.assign(f"R_{i}_{k}", self.cov[i, k] + process_variance * unit_noise)
+
+    def condition(
+        self, output_slope: Sequence[sp.Expr], cross_cov: dict[str, sp.Expr], inverse_innovation_cov: sp.Expr, scaled_innovation: sp.Expr, retained_fraction: sp.Expr,
+        tag: str, is_observed: sp.Expr = ONE,
+    ) -> None:  # fmt: skip
+        """Condition on a sensor: mean + c step, Q - c cᵀ weight; ``retained_fraction`` is r weight; ``is_observed`` is 0 for no output.
+
+        A quantity that the sensor shows as it is keeps its row times r/S, which cannot become negative by rounding.
+        """
+        measured = [i for i, h in zip(self.names, output_slope, strict=True) if h == 1]
+        measured_quantity = measured[0] if sum(h != 0 for h in output_slope) == 1 and measured else None
+        gain = {
+            i: self.assign(f"K{tag}_{i}", inverse_innovation_cov * cross_cov[i])
+            for i in self.names
+            if i != measured_quantity
+        }
+        for i in self.names:
+            if cross_cov[i] != 0 and scaled_innovation != 0:
+                self.mean[i] = self.assign(f"M{tag}_{i}", self.mean[i] + cross_cov[i] * scaled_innovation)
+        rounding_factor = self.assign(f"GROWN{tag}", 1 + sp.Float(ROUNDING) * is_observed)
+        for (i, j), value in list(self.cov.items()):
+            factor = rounding_factor if i == j else ONE
+            if measured_quantity in (i, j):
+                other = j if i == measured_quantity else i
+                self.cov[i, j] = self.assign(f"P{tag}_{i}_{j}", retained_fraction * cross_cov[other] * factor)
+            elif cross_cov[i] != 0 and cross_cov[j] != 0:
+                self.cov[i, j] = self.assign(f"P{tag}_{i}_{j}", value * factor - gain[i] * cross_cov[j])
+
+    def row_results(self) -> dict[str, str]:
+        """Row of the belief to the name that holds its new value, where it has one."""
+        row_values = {name: print_expression(value) for name, value in self.mean.items()}
+        for i, j in self.cov:
+            row_values[f"P_{i}_{j}"] = print_expression(self.cov[i, j])
+        return {row: value for row, value in row_values.items() if row != value}
+
+
+def belief_update(
+    model: Model, propagation: Propagation, degree: int, iterations: int, keep_trace: bool, may_be_missing: bool
+) -> tuple[Assignments, dict[str, str]]:
+    """Condition on all sensors' outputs ``Y_<sensor>``, and learn the noises: assignments and results by row.
+
+    Args:
+        model: whose belief.
+        propagation: the motion over the sample.
+        degree: of the input's polynomial, or taps less one.
+        iterations: variational iterations.
+        keep_trace: also leave what the free energy of every iteration needs, in rows ``TRACE_<sensor's number>_<what>``.
+        may_be_missing: an output that is NaN moves nothing but the state.
+    """
+    g = GaussianUpdate(model, propagation)
+    results: dict[str, str] = {}
+    informative_sensor = [
+        k for k in range(model.n_outputs) if g.output_process_noise(g.predicted_output(k, degree)[1]) != 0
+    ][:1]
+    if not informative_sensor:  # no sensor tells of γ: the noise moves the states as it is believed to
+        g.add_process_noise(g.assign("Q_unseen", symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")))
+    for k, sensor in enumerate(model.outputs):
+        tag, y = str(k), symbol(f"Y_{sensor}")
+        expected, output_slope = g.predicted_output(k, degree)
+        expected = g.assign(f"Y{tag}", expected)
+        cross_cov, s = g.innovation_covariance(output_slope, tag)
+        output_noise = g.assign(f"N{tag}", g.output_process_noise(output_slope)) if k in informative_sensor else ZERO
+        is_observed = g.assign(f"Z{tag}", is_present(y)) if may_be_missing else ONE
+        e = g.assign(f"E{tag}", select(is_observed, y - expected, ZERO) if may_be_missing else y - expected)
+        noise_iterations = _update_noises(g, tag, sensor, (s, e, output_noise, is_observed), iterations)
+        last = noise_iterations[-1]
+        if output_noise != 0:
+            noise_cross_cov = {i: sum((output_slope[b] * n for b, n in enumerate(row)), ZERO)
+                     for i, row in zip(g.states, g.propagation.noise_cov, strict=True)}  # fmt: skip
+            cross_cov |= {
+                i: g.assign(f"D{tag}_{i}", cross_cov[i] + last.process_variance * part)
+                for i, part in noise_cross_cov.items()
+                if part != 0
+            }
+            g.add_process_noise(last.process_variance)
+            results |= {
+                "GAMMA_SHAPE": print_expression(last.gamma_shape),
+                "GAMMA_RATE": print_expression(last.gamma_rate),
+            }
+        results |= {
+            f"XI_SHAPE_{sensor}": print_expression(last.xi_shape),
+            f"XI_RATE_{sensor}": print_expression(last.xi_rate),
+        }
+        retained_fraction = last.r * last.inverse_innovation_cov
+        inverse_innovation_cov = g.assign(f"W{tag}", is_observed * last.inverse_innovation_cov)
+        retained_fraction = g.assign(
+            f"H{tag}", select(is_observed, retained_fraction, ONE) if may_be_missing else retained_fraction
+        )
+        g.condition(
+            output_slope, cross_cov, inverse_innovation_cov, last.scaled_innovation, retained_fraction, tag, is_observed
+        )
+        if keep_trace:
+            traced = {"mean": expected, "innovation": e, "variance": s, "shown": output_noise}
+            for i, one in enumerate(noise_iterations):
+                traced |= {f"q_{i}": one.q, f"r_{i}": one.r}
+            results |= {f"TRACE_{tag}_{what}": print_expression(value) for what, value in traced.items()}
+    return g.lines, results | g.row_results()
+
+
+class NoiseIteration(NamedTuple):
+    """What an iteration assumes and finds, in symbols.
+
+    Attributes:
+        process_variance: E[w²] of unit process noise that it assumes, 1/E[γ].
+        q, r: variances of both noises in the output that it assumes.
+        weight, scaled_innovation: 1/S, and the innovation times it.
+        gamma_shape, gamma_rate, xi_shape, xi_rate: the beliefs that it finds.
+    """
+
+    process_variance: sp.Expr
+    q: sp.Expr
+    r: sp.Expr
+    inverse_innovation_cov: sp.Expr
+    scaled_innovation: sp.Expr
+    gamma_shape: sp.Expr
+    gamma_rate: sp.Expr
+    xi_shape: sp.Expr
+    xi_rate: sp.Expr
+
+
+def _update_noises(
+    g: GaussianUpdate, tag: str, sensor: str, scalars: tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr], iterations: int
+) -> list[NoiseIteration]:
+    """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
+
+    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
+    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
+    """
+    s, e, output_noise, is_observed = scalars
+    gamma_rate, xi_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
+    gamma_shape, xi_shape = symbol("GAMMA_SHAPE"), symbol(f"XI_SHAPE_{sensor}")
+    half_count = g.assign(f"U{tag}", HALF * is_observed)
+    new_gamma_shape = g.assign(f"F{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
+    new_xi_shape = g.assign(f"X{tag}", xi_shape + half_count)
+    # Divisions are dear, and every iteration has the same shapes.
+    inverse_gamma_shape = g.assign(f"V{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
+    inverse_xi_shape = g.assign(f"A{tag}", 1 / new_xi_shape)
+    process_variance = g.assign(f"B{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO
+    r = g.assign(f"R{tag}_0", xi_rate / xi_shape)
+    noise_iterations = []
+    for i in range(iterations):
+        q = g.assign(f"Q{tag}_{i}", output_noise * process_variance)
+        inverse_innovation_cov = g.assign(f"L{tag}_{i}", 1 / (s + q + r))
+        scaled_innovation = g.assign(f"J{tag}_{i}", e * inverse_innovation_cov)
+        square = g.assign(f"T{tag}_{i}", scaled_innovation**2)
+        new_gamma_rate, new_xi_rate = (
+            g.assign(
+                f"{letter}{tag}_{i}", rate + half_count * variance * (v * square + (1 - v * inverse_innovation_cov))
+            )
+            if v != 0
+            else rate
+            for letter, rate, variance, v in (("G", gamma_rate, process_variance, q), ("O", xi_rate, r, r))
+        )
+        noise_iterations.append(
+            NoiseIteration(
+                process_variance,
+                q,
+                r,
+                inverse_innovation_cov,
+                scaled_innovation,
+                new_gamma_shape,
+                new_gamma_rate,
+                new_xi_shape,
+                new_xi_rate,
+            )
+        )
+        process_variance = (
+            g.assign(f"B{tag}_{i + 1}", new_gamma_rate * inverse_gamma_shape) if output_noise != 0 else ZERO
+        )
+        r = g.assign(f"R{tag}_{i + 1}", new_xi_rate * inverse_xi_shape)
+    return noise_iterations
+
+
+def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:
+    """One imagined sample: `belief_update` with outputs as expected and noise variances ``Q`` and ``R_<sensor>`` given.
+
+    Leaves what the first sensor is expected to show in ``SHOWN``, its predictive variance in ``SPREAD``, and in
+    ``SURPRISE`` that of `GaussianUpdate.pending_output_variance`, which is 0 for the first sample: the row ``BEGUN`` is 1 after it.
+    """
+    g = GaussianUpdate(model, propagation)
+    results: dict[str, str] = {}
+    g.add_process_noise(symbol("Q"))
+    for k, sensor in enumerate(model.outputs):
+        tag, r = str(k), symbol(f"R_{sensor}")
+        expected, output_slope = g.predicted_output(k, degree)
+        cross_cov, s = g.innovation_covariance(output_slope, tag)
+        inverse_innovation_cov = g.assign(f"L{tag}", 1 / (s + r))
+        if k == 0:
+            pending_variance = g.assign("MOVED", symbol("BEGUN") * g.pending_output_variance(output_slope, r))
+            results |= {
+                "SHOWN": print_expression(g.assign("Y0", expected)),
+                "SPREAD": print_expression(g.assign("V0", s + r)),
+            }
+            results |= {"SURPRISE": print_expression(pending_variance), "BEGUN": "1.0"}
+        g.condition(
+            output_slope, cross_cov, inverse_innovation_cov, ZERO, g.assign(f"H{tag}", r * inverse_innovation_cov), tag
+        )
+    found = g.row_results()
+    return g.lines, results | {row: value for row, value in found.items() if row not in model.coefficients}

@@ -1,0 +1,229 @@
+"""Two of the tasks that the engine compiles for a model: the update of a belief, and the path of the states.
+
+Each gives compiled functions over a block ``W`` (`estimator.compilation.simd`), and the layout of its rows. What stands in a block
+of ``lanes`` systems is what `layout` lists; whoever needs more rows adds them behind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from estimator.compilation import elementary_functions
+from estimator.compilation.scalar_jit import scalar_jit
+from estimator.compilation.simd import LANES, number_rows
+from estimator.engine import source_cache as stored
+from estimator.engine.storage_layout import (
+    cubature_order,
+    cubature_rows,
+    integrator_rows,
+    linearised_filter_layout,
+    trace_rows,
+    update_layout,
+)
+from estimator.inference import EXPECTATIONS, MAX_ITERATIONS
+from estimator.models.model import GENERATED_FUNCTIONS, Model
+from estimator.support.argument_checks import check_choice, check_integer
+
+
+@scalar_jit
+def sqrt(value):
+    """Square root."""
+    return np.sqrt(value)
+
+
+#: What generated code may use.
+RUNTIME_FUNCTIONS = {"sqrt": sqrt} | {
+    name: getattr(elementary_functions, name) for name in GENERATED_FUNCTIONS if name != "sqrt"
+}
+
+
+@dataclass(frozen=True)
+class BeliefUpdate:
+    """The belief update of a model.
+
+    Attributes:
+        update: ``update(W)``: every lane's belief, with its rows ``U_k`` and ``Y_<sensor>``.
+        layout: rows of the block.
+        count_unsound: with sigma points, ``count_unsound(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is not
+            positive semi-definite. The update does so with the belief that it is given.
+    """
+
+    update: Any
+    layout: Mapping[str, int]
+    count_unsound: Any = None
+
+
+def compile_belief_update(
+    model: Model,
+    degree: int = 0,
+    *,
+    iterations: int = 3,
+    lanes: int = LANES,
+    block_layout: Mapping[str, int] | None = None,
+    keep_trace: bool = False,
+    may_be_missing: bool = False,
+    expectations: str = "first_order",
+) -> BeliefUpdate:
+    """The structured update: q(states, coefficients) Gaussian, q(γ) and q(ξ) Gamma.
+
+    Args:
+        model: whose belief.
+        degree: of the input's polynomial over a sample, for a differential equation: 0 held, 1 linear, 5 a spline.
+        iterations: variational iterations per sample, 1 to 100.
+        lanes: systems in a block.
+        block_layout: a layout that holds all rows of `layout`; its own where it is None.
+        keep_trace: leave what the free energy of every iteration needs, in further rows.
+        may_be_missing: outputs that are NaN move the state and teach nothing.
+        expectations: how the belief is moved: ``first_order`` or ``sigma_points`` (`estimator.engine.cubature`). The
+            latter counts in the row ``UNSOUND`` where it meets a covariance that is not positive semi-definite.
+
+    Raises:
+        ValueError: for iterations out of range, or other expectations.
+    """
+    frozen = None if block_layout is None else tuple(block_layout.items())
+    return _compile_belief_update(model, degree, iterations, lanes, frozen, keep_trace, may_be_missing, expectations)
+
+
+@cache
+def _compile_belief_update(
+    model: Model,
+    degree: int,
+    iterations: int,
+    lanes: int,
+    block_layout: Any,
+    keep_trace: bool,
+    may_be_missing: bool,
+    expectations: str,
+) -> BeliefUpdate:
+    check_integer("iterations", iterations, MAX_ITERATIONS)
+    check_choice("expectations", expectations, EXPECTATIONS)
+    uses_cubature = expectations == "sigma_points"
+    layout = dict(block_layout) if block_layout is not None else update_layout(model, degree)
+    more_rows = [
+        *(trace_rows(model, iterations) if keep_trace else ()),
+        *(cubature_rows(model) if uses_cubature else ()),
+    ]
+    layout |= number_rows(*(row for row in more_rows if row not in layout), first_row=max(layout.values()) + 1)
+
+    def make() -> str:
+        from estimator.engine import gaussian_update, printer_numba, symbolic, variational_rk4
+        from estimator.engine.cubature import point_moments
+
+        lines, propagation = point_moments(model) if uses_cubature else symbolic.propagate_sample(model)
+        more, results = gaussian_update.belief_update(
+            model, propagation, degree, iterations, keep_trace, may_be_missing
+        )
+        # Every layer of functions is compiled: what a difference equation finishes is all of its update.
+        whole = not (uses_cubature or model.is_continuous)
+        name = "update" if whole else "finish"
+        finish = printer_numba.print_lane_loop(name, lines + more, results, layout, lanes, doc="Predict and condition.")
+        if whole:
+            return finish
+        if uses_cubature:
+            return finish + _cubature_source(model, degree, layout, lanes)
+        motion = variational_rk4.print_integrator(model, degree, layout, lanes)
+        return motion + finish + printer_numba.print_sample("update(W)", model, "finish(W)")
+
+    key = repr(
+        (model.digest, degree, iterations, lanes, sorted(layout.items()), keep_trace, may_be_missing, expectations)
+    )
+    code = stored.load_generated(model.name, "update", key, make, RUNTIME_FUNCTIONS)
+    return BeliefUpdate(code.update, layout, code.spread if uses_cubature else None)
+
+
+def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes: int) -> str:
+    """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
+    from estimator.engine import cubature, printer_numba, symbolic, variational_rk4
+
+    names = cubature_order(model)
+    point_layout: dict[str, int | str] = dict(layout)
+    point_layout |= {f"L_C_{i}": f"{layout[f'L_0_{names[0]}']} + C*{len(names)} + {k}" for k, i in enumerate(names)}
+    first = layout[f"I_0_{next(iter(model.states))}"]
+    point_layout |= {f"I_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
+
+    def loop(name: str, lines: Any, results: Any, uniform: tuple[str, ...], doc: str) -> str:
+        return printer_numba.print_lane_loop(name, lines, results, point_layout, lanes, uniform, doc)
+
+    source = loop(
+        "spread", *cubature.cubature_columns(model), (), "Columns of the covariance's factor, and their weights."
+    )
+    if not model.is_continuous:
+        sample = cubature.propagate_point_difference(model)
+        source += loop("carry", *sample, ("C", "SIGN", "P"), "One point over the sample.")
+        return source + _loop_over_points(model, "", "        carry(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
+    noise = [name for name in integrator_rows(model) if name[0] != "S"]
+    start = {
+        i: printer_numba.print_expression(value) for i, value in symbolic.integrator_start(model).items() if i in noise
+    }
+    source += loop("begin", [], start, (), "The mean, and its process noise.")
+    step = variational_rk4.variational_rk4_step(model, degree)
+    source += loop("drift", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise.")
+    source += loop("place", *cubature.place_point(model), ("C", "SIGN"), "A point at the start of the sample.")
+    step, moved = cubature.propagate_point(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
+    source += loop("move", step, moved, ("T",), "One Runge-Kutta step of a point.")
+    source += loop("keep", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
+    n = model.substeps
+    noise_loop = f"    begin(W)\n    for s in range({n}):\n        drift(W, s / {n})\n"
+    body = "        place(W, P // 2, 1.0 - 2.0 * (P % 2))\n"
+    body += f"        for s in range({n}):\n            move(W, s / {n})\n        keep(W, P)\n"
+    return source + _loop_over_points(model, noise_loop, body)
+
+
+def _loop_over_points(model: Model, before: str, body: str) -> str:
+    """Source of ``update(W)`` over all sigma points."""
+    head = f"@scalar_jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
+    return head + body + "    finish(W)\n"
+
+
+@dataclass(frozen=True)
+class LinearisedFilter:
+    """A path at known coefficients: likelihood and Fisher information; `estimator.engine.adjoint` has the gradient.
+
+    Attributes:
+        sample: ``sample(W)``: one sample of every lane.
+        layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the variances ``Q`` and
+            ``R_<sensor>`` of the noises, the path and what it adds up.
+        lanes: systems in it.
+    """
+
+    sample: Any
+    layout: Mapping[str, int]
+    lanes: int
+
+
+@cache
+def compile_linearised_filter(
+    model: Model, degree: int = 0, *, follows_outputs: bool, lanes: int = LANES, variable_step: bool = False
+) -> LinearisedFilter:
+    """The path of a model (`estimator.engine.linearised_filter.linearised_filter_step`).
+
+    Args:
+        model: whose equation.
+        degree: of the input's polynomial over a sample.
+        follows_outputs: whether the filter follows outputs.
+        lanes: systems in a block.
+        variable_step: whether each sample of a differential equation has a length of its own, in the row ``SPAN``.
+    """
+    layout = linearised_filter_layout(model, degree, follows_outputs, variable_step)
+
+    def make() -> str:
+        from estimator.engine import printer_numba, symbolic, variational_rk4
+        from estimator.engine.gaussian_update import ONE
+        from estimator.engine.linearised_filter import linearised_filter_step
+
+        lines, propagation = symbolic.propagate_sample(model)
+        more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
+        span = symbolic.symbol("SPAN") if variable_step else ONE
+        source = variational_rk4.print_integrator(model, degree, layout, lanes, sample_length=span)
+        source += printer_numba.print_lane_loop("finish", lines + more, results, layout, lanes, doc="Predict and see.")
+        return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
+
+    key = repr((model.digest, degree, follows_outputs, lanes, variable_step))
+    return LinearisedFilter(
+        stored.load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes
+    )

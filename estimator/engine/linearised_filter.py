@@ -1,0 +1,119 @@
+"""The packed algebra of a path: the Kalman filter of a model linearised along its own trajectory, as assignments."""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from estimator.engine.gaussian_update import HALF, ZERO
+from estimator.engine.printer_numba import print_expression
+from estimator.engine.storage_layout import likelihood_rows
+from estimator.engine.symbolic import (
+    Assignments,
+    Program,
+    Propagation,
+    differentiate,
+    input_at_end,
+    symbol,
+    symmetric_entry,
+)
+from estimator.models.model import Model
+
+
+def linearised_filter_step(
+    model: Model, propagation: Propagation, degree: int, follows_outputs: bool
+) -> tuple[Assignments, dict[str, str]]:
+    """One sample of the Kalman filter of the model linearised along its own trajectory, at known coefficients.
+
+    With Z the sensitivities of the state's mean, A its slope by the state and B by the coefficients (both in S),
+
+        V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
+
+    Names besides `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0
+    where the sample is not counted.
+
+    Args:
+        model: whose equation.
+        propagation: the motion over the sample.
+        degree: of the input's polynomial.
+        follows_outputs: whether the filter follows the outputs ``Y_<sensor>``, or the response without noise. The latter
+            leaves what the sensors show in ``SHOWN_<sensor>``, and the first one's predictive variance in ``SPREAD``.
+    """
+    states, coefficients = list(model.states), list(model.coefficients)
+    n, lines = len(states), Program()
+    assign = lines.assign
+    mean = dict(zip(states, propagation.state, strict=True))
+    cov: dict[tuple[str, str], sp.Expr] = {}
+    for a, i in enumerate(states):
+        row = {
+            k: assign(
+                f"B_{i}_{k}",
+                sum((propagation.jacobian[a][m] * symmetric_entry("V", states[m], k, states) for m in range(n)), ZERO),
+            )
+            for k in states
+        }
+        for b in range(a, n):
+            total = sum(
+                (propagation.jacobian[b][m] * row[states[m]] for m in range(n)),
+                symbol("Q") * propagation.noise_cov[a][b],
+            )
+            cov[i, states[b]] = assign(f"W_{i}_{states[b]}", total)
+    state_sensitivity = {
+        (i, c): assign(
+            f"X_{i}_{c}",
+            sum(
+                (propagation.jacobian[a][m] * symbol(f"Z_{states[m]}_{c}") for m in range(n)),
+                propagation.jacobian[a][n + b],
+            ),
+        )
+        for a, i in enumerate(states)
+        for b, c in enumerate(coefficients)
+    }
+    at = lambda i, k: cov[(i, k) if states.index(i) <= states.index(k) else (k, i)]  # noqa: E731
+    found = differentiate(model)
+    results: dict[str, str] = {}
+    totals = {name: symbol(name) for name in likelihood_rows(model)}
+    for k, sensor in enumerate(model.outputs):
+        tag = str(k)
+        at_mean = {symbol(i): value for i, value in mean.items()} | {symbol("u"): input_at_end(model, degree)}
+        predicted_output = assign(f"Y{tag}", found.outputs[k].xreplace(at_mean))
+        h = [slope.xreplace(at_mean) for slope in found.output_slopes[k]]
+        cross_cov = {i: assign(f"C{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
+        state_part_variance = assign(f"G{tag}", sum((h[m] * cross_cov[states[m]] for m in range(n)), ZERO))
+        innovation_variance = assign(f"S{tag}", state_part_variance + symbol(f"R_{sensor}"))
+        inverse_innovation_variance = assign(f"L{tag}", 1 / innovation_variance)
+        output_sensitivity = {
+            name: assign(f"T{tag}_{name}", sum((h[m] * state_sensitivity[states[m], name] for m in range(n)), h[n + b]))
+            for b, name in enumerate(coefficients)
+        }
+        counted = assign(f"I{tag}", symbol("LIVE") * inverse_innovation_variance)
+        weighted_sensitivity = {
+            name: assign(f"U{tag}_{name}", counted * output_sensitivity[name]) for name in coefficients
+        }
+        for b, name in enumerate(coefficients):
+            for other in coefficients[b:]:
+                totals[f"F_{name}_{other}"] += weighted_sensitivity[name] * output_sensitivity[other]
+        innovation = assign(f"E{tag}", symbol(f"Y_{sensor}") - predicted_output) if follows_outputs else ZERO
+        if follows_outputs:
+            misfit = assign(f"D{tag}", counted * innovation**2)
+            totals["LOSS"] += HALF * (misfit - symbol("LIVE") * sp.log(inverse_innovation_variance))
+            totals["MISFIT"] += misfit
+            for name in coefficients:
+                totals[f"SLOPE_{name}"] -= weighted_sensitivity[name] * innovation
+            results[f"SPREAD_{sensor}"] = print_expression(state_part_variance)
+        elif k == 0:
+            results["SPREAD"] = print_expression(innovation_variance)
+        results[f"SHOWN_{sensor}"] = print_expression(predicted_output)
+        gain = {i: assign(f"K{tag}_{i}", inverse_innovation_variance * cross_cov[i]) for i in states}
+        mean = {i: assign(f"J{tag}_{i}", mean[i] + gain[i] * innovation) for i in states}
+        state_sensitivity = {
+            (i, name): assign(f"O{tag}_{i}_{name}", state_sensitivity[i, name] - gain[i] * output_sensitivity[name])
+            for i, name in state_sensitivity
+        }
+        cov = {(i, j): assign(f"P{tag}_{i}_{j}", value - gain[i] * cross_cov[j]) for (i, j), value in cov.items()}
+    results |= {i: print_expression(mean[i]) for i in states}
+    results |= {f"V_{i}_{j}": print_expression(value) for (i, j), value in cov.items()}
+    results |= {f"Z_{i}_{name}": print_expression(value) for (i, name), value in state_sensitivity.items()}
+    for name, total in totals.items():
+        if total != symbol(name):
+            results[name] = print_expression(assign(f"{name}_e", total))
+    return lines, results

@@ -1,0 +1,92 @@
+"""What stands in the blocks of the engine: names of rows, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import combinations_with_replacement
+
+from estimator.compilation.simd import number_rows
+from estimator.models.model import Model
+
+
+def upper_triangle_names(matrix: str, names: Iterable[str]) -> list[str]:
+    """Names of a symmetric matrix's entries: its upper triangle, row by row."""
+    return [f"{matrix}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
+
+
+def belief_rows(model: Model) -> list[str]:
+    """The flat record of a belief: means, upper triangle of the covariance, shape and rate of γ and of each ξ."""
+    sensors = [f"XI_{part}_{y}" for y in model.outputs for part in ("SHAPE", "RATE")]
+    return [*model.names, *upper_triangle_names("P", model.names), "GAMMA_SHAPE", "GAMMA_RATE", *sensors]
+
+
+def input_rows(model: Model, degree: int) -> list[str]:
+    """The input over a sample: taps of a difference equation, or coefficients of the polynomial in τ."""
+    return [f"U_{k}" for k in range(model.taps if not model.is_continuous else degree + 1)]
+
+
+def integrator_rows(model: Model) -> list[str]:
+    """What a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held.
+
+    Nothing for a difference equation.
+    """
+    if not model.is_continuous:
+        return []
+    names = [f"M_{i}" for i in model.states] + [f"S_{i}_{j}" for i in model.states for j in model.movers]
+    return names + ([f"D_{i}" for i in model.states] if model.held else upper_triangle_names("N", model.states))
+
+
+def update_layout(model: Model, degree: int) -> dict[str, int]:
+    """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
+    outputs = [f"Y_{y}" for y in model.outputs]
+    return number_rows(*belief_rows(model), *input_rows(model, degree), *outputs, *integrator_rows(model))
+
+
+def cubature_order(model: Model) -> list[str]:
+    """Quantities in the order of the rows of the sigma points' factor L."""
+    return [*model.movers, *(name for name in model.names if name not in model.movers)]
+
+
+def cubature_rows(model: Model) -> list[str]:
+    """Rows of the sigma points (`estimator.engine.cubature`)."""
+    columns, movers = range(len(model.movers)), model.movers
+    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
+    at_point = [f"X_{i}" for i in movers if i not in model.states]
+    factor = [f"L_{c}_{i}" for c in columns for i in cubature_order(model)]
+    return [*factor, *(f"WEIGHT_{c}" for c in columns), *at_point, *images, "UNSOUND"]
+
+
+def trace_rows(model: Model, iterations: int) -> list[str]:
+    """Rows that `structured` leaves for the free energy, per sensor."""
+    names = []
+    for k in range(model.n_outputs):
+        names += [f"TRACE_{k}_{what}" for what in ("mean", "innovation", "variance", "shown")]
+        names += [f"TRACE_{k}_{what}_{i}" for i in range(iterations) for what in ("q", "r")]
+    return names
+
+
+def filter_state_rows(model: Model) -> list[str]:
+    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    sensitivities = [f"Z_{i}_{c}" for i in model.states for c in model.coefficients]
+    return [*model.states, *upper_triangle_names("V", model.states), *sensitivities]
+
+
+def likelihood_rows(model: Model) -> list[str]:
+    """What a path adds up: minus the log likelihood, its slope, the information (upper triangle), and Σ ν²/S."""
+    return [
+        "LOSS",
+        *(f"SLOPE_{c}" for c in model.coefficients),
+        *upper_triangle_names("F", model.coefficients),
+        "MISFIT",
+    ]
+
+
+def linearised_filter_layout(
+    model: Model, degree: int, follows_outputs: bool, variable_step: bool = False
+) -> dict[str, int]:
+    """Rows of a path's block; ``SPAN`` is the length of a sample, where each has its own."""
+    seen = [f"{what}_{y}" for what in ("Y", "SHOWN", "SPREAD") for y in model.outputs]
+    shown = seen if follows_outputs else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
+    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]
+    given += ["SPAN"] if variable_step else []
+    return number_rows(*filter_state_rows(model), *likelihood_rows(model), *given, *integrator_rows(model))

@@ -1,0 +1,314 @@
+"""From a model to assignments: the calculus, by SymPy.
+
+Everything that the engine compiles is a list of assignments ``(name, expression)`` in the order of execution: the
+model's own expressions with their derivatives, one Runge-Kutta step of them, the packed algebra of a Gaussian, and the
+reverse of all these. Names of the engine begin with a capital letter:
+
+==========  ===========================================================================================
+``M_i``     state i after the sample, before its process noise
+``S_i_j``   its derivative by quantity j (a state before the sample, or a coefficient)
+``N_i_k``   covariance of states i and k that process noise of unit strength brings
+``P_i_j``   covariance of quantities i and j, and ``Q_i_j`` the predicted one
+``U_k``     the input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
+==========  ===========================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import sympy as sp
+
+from estimator.engine.storage_layout import integrator_rows
+from estimator.models.model import FUNCTIONS, MAX_POWER, Model, names_in_expression
+
+Assignments = list[tuple[str, sp.Expr]]
+
+
+class Program(Assignments):
+    """Assignments that grow."""
+
+    def assign(self, name: str, expression: sp.Expr) -> sp.Expr:
+        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
+        if expression.is_Number or expression.is_Symbol:
+            return expression
+        self.append((name, expression))
+        return symbol(name)
+
+
+def _absolute_value(value: sp.Expr) -> sp.Expr:
+    """|value|. Of what SymPy does not know to be real, such as a logarithm, it would differentiate the parts."""
+    value = sp.sympify(value)
+    return sp.Abs(value) if value.is_extended_real else sp.sqrt(value**2)
+
+
+_FUNCTIONS = {name: getattr(sp, name) for name in FUNCTIONS if name != "abs"} | {"abs": _absolute_value}
+
+
+def symbol(name: str) -> sp.Symbol:
+    """The real symbol of a name."""
+    return sp.Symbol(name, real=True)
+
+
+def symmetric_entry(matrix: str, first: str, second: str, order: Sequence[str]) -> sp.Symbol:
+    """The symbol of a symmetric matrix's entry: of the two, the one that stands first in ``order`` comes first."""
+    if order.index(first) > order.index(second):
+        first, second = second, first
+    return symbol(f"{matrix}_{first}_{second}")
+
+
+@dataclass(frozen=True)
+class ModelDerivatives:
+    """A model's expressions and derivatives, in symbols.
+
+    Attributes:
+        moves: the rates or next states.
+        jacobian: (n, movers) derivatives of ``moves`` by `Model.is_dynamic`; the others need no sensitivity.
+        noise: how unit noise moves each state.
+        outputs: what each sensor shows.
+        output_slopes: of each sensor, the derivatives by all quantities.
+    """
+
+    moves: tuple[sp.Expr, ...]
+    jacobian: tuple[tuple[sp.Expr, ...], ...]
+    noise: tuple[sp.Expr, ...]
+    outputs: tuple[sp.Expr, ...]
+    output_slopes: tuple[tuple[sp.Expr, ...], ...]
+
+
+@cache
+def differentiate(model: Model) -> ModelDerivatives:
+    """Parse and differentiate a model.
+
+    Raises:
+        ValueError: for text that is not an expression, or uses a name that the model does not have.
+    """
+    symbols = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
+    moves = tuple(parse_expression(text, symbols, model.name) for text in model.moves)
+    without_input = {name: symbols[name] for name in model.names}
+    noise = tuple(parse_expression(text, without_input, model.name) for text in model.noise)
+    outputs = tuple(parse_expression(text, symbols, model.name) for text in model.outputs.values())
+    jacobian = tuple(tuple(sp.diff(move, symbols[name]) for name in model.movers) for move in moves)
+    output_slopes = tuple(tuple(sp.diff(shown, symbols[name]) for name in model.names) for shown in outputs)
+    return ModelDerivatives(moves, jacobian, noise, outputs, output_slopes)
+
+
+def parse_expression(text: str, symbols: Mapping[str, sp.Symbol], model_name: str) -> sp.Expr:
+    """An expression in known names.
+
+    Raises:
+        ValueError: naming the text, for what is not an expression, or a name that is not known.
+    """
+    names_in_expression(text, symbols, model_name)
+    try:
+        parsed = sp.sympify(eval(text.strip(), {"__builtins__": {}}, {**_FUNCTIONS, **symbols}))
+    except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
+        raise ValueError(f"expressions of {model_name} must be formulas, but {text!r} is not one: {error}") from error
+    if not isinstance(parsed, sp.Expr):
+        raise ValueError(f"expressions of {model_name} must be numbers, but {text!r} is {parsed!r}")
+    if parsed.has(sp.I, sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise ValueError(f"expressions of {model_name} must be finite and real, but {text!r} is {parsed}")
+    parsed = parsed.replace(lambda part: part.is_Pow and part.exp.is_Float, lambda p: p.base ** sp.Rational(p.exp))
+    for power in parsed.atoms(sp.Pow):
+        if power.exp.is_Number and abs(power.exp) > MAX_POWER:
+            raise ValueError(
+                f"powers of {model_name} must be from -{MAX_POWER} to {MAX_POWER}, but {text!r} has {power}"
+            )
+    return parsed
+
+
+def eliminate_common_subexpressions(expressions: Mapping[str, sp.Expr], prefix: str) -> Assignments:
+    """Assignments of ``expressions`` that calculate common subexpressions once, as ``prefix_0``, ``prefix_1``, ..."""
+    symbols = sp.numbered_symbols(f"{prefix}_", real=True)
+    parts, reduced = sp.cse(list(expressions.values()), symbols=symbols, optimizations=None)
+    return [*((str(name), expression) for name, expression in parts), *zip(expressions, reduced, strict=True)]
+
+
+def substitute(assignments: Iterable[tuple[str, sp.Expr]], replacements: Mapping[str, sp.Expr | str]) -> Assignments:
+    """Assignments with other names, or expressions in the place of names."""
+    mapping = {symbol(old): symbol(new) if isinstance(new, str) else new for old, new in replacements.items()}
+    return [(str(mapping.get(symbol(name), name)), expression.xreplace(mapping)) for name, expression in assignments]
+
+
+# ---------------------------------------------------------------------------------------------- moving over a sample
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Where a sample moves the state: names or numbers of M, S and N after it, in symbols.
+
+    ``jacobian`` is empty where the predicted covariance is not S P Sᵀ but stands in ``Q_i_j``. ``is_psd`` where N is
+    positive semi-definite by how it is made.
+    """
+
+    state: tuple[sp.Expr, ...]
+    jacobian: tuple[tuple[sp.Expr, ...], ...]
+    noise_cov: tuple[tuple[sp.Expr, ...], ...]
+    is_psd: bool = True
+
+
+def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagation]:
+    """M, S and N of a difference equation: one evaluation of the next state and its derivatives."""
+    c = differentiate(model)
+    inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
+    named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
+    for i, row in zip(model.states, c.jacobian, strict=True):
+        named |= {f"S_{i}_{j}": slope for j, slope in zip(model.movers, row, strict=True)}
+    lines = substitute(eliminate_common_subexpressions(named, "W"), inputs)
+    # What is a number or a bare name needs no line of its own.
+    trivial = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
+    lines = [(name, e) for name, e in lines if name not in trivial]
+    value = lambda name: trivial.get(name, symbol(name))  # noqa: E731
+    is_dynamic = dict.fromkeys(model.names, False) | dict.fromkeys(model.movers, True)
+    jacobian = tuple(
+        tuple(value(f"S_{i}_{j}") if is_dynamic[j] else sp.S.Zero for j in model.names) for i in model.states
+    )
+    noise = tuple(tuple(a * b for b in c.noise) for a in c.noise)
+    return lines, Propagation(tuple(value(f"M_{i}") for i in model.states), jacobian, noise)
+
+
+def integrator_start(model: Model) -> dict[str, sp.Expr]:
+    """What is carried, at the start of a sample."""
+    start: dict[str, sp.Expr] = dict.fromkeys(integrator_rows(model), sp.S.Zero)
+    for i in model.states:
+        start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
+    return start
+
+
+def integrator_end(model: Model) -> Propagation:
+    """What is carried, as a sample leaves it."""
+    states = list(model.states)
+    jacobian = tuple(
+        tuple(symbol(f"S_{i}_{j}") if j in model.movers else sp.S.Zero for j in model.names) for i in states
+    )
+    if model.held:
+        noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)
+    else:
+        noise = tuple(tuple(symmetric_entry("N", i, k, states) for k in states) for i in states)
+    return Propagation(tuple(symbol(f"M_{i}") for i in states), jacobian, noise, is_psd=model.held)
+
+
+def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
+    """What is left to assign at the end of a sample, and where it moved the state."""
+    return ([], integrator_end(model)) if model.is_continuous else propagate_difference_equation(model)
+
+
+def runge_kutta_4(
+    variables: Sequence[str], rate_assignments: Assignments, substeps: int, sample_length: sp.Expr = sp.S.One
+) -> Assignments:
+    """One step of order 4, of a ``substeps``-th of a sample: from ``variables`` to ``<name>_E``.
+
+    What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.
+
+    Args:
+        variables: what moves.
+        rate_assignments: assignments of its derivatives ``K_<name>`` in the names and the input ``u``.
+        substeps: per sample.
+        sample_length: length of the sample, in sampling steps.
+    """
+    h = sample_length * sp.Rational(1, substeps)
+    lines: Assignments = []
+    rates: list[dict[str, sp.Expr]] = []
+    for k, fraction in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
+        tag = "ABCD"[k]
+        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'B'}"}
+        for name in variables:
+            if k:
+                lines.append((f"{name}_{tag}", symbol(name) + fraction * h * rates[-1][name]))
+                at[name] = f"{name}_{tag}"
+        rename = {name: f"{name}_{tag}" for name, _ in rate_assignments}
+        stage_rates: dict[str, sp.Expr] = {}
+        for name, expression in substitute(rate_assignments, {**rename, **at}):
+            if name.startswith("K_") and (expression.is_Symbol or expression.is_Number):
+                stage_rates[name[2 : -len(tag) - 1]] = expression
+            else:
+                lines.append((name, expression))
+                if name.startswith("K_"):
+                    stage_rates[name[2 : -len(tag) - 1]] = symbol(name)
+        rates.append(stage_rates)
+    k1, k2, k3, k4 = rates
+    sixth = h / 6
+    return lines + [
+        (f"{name}_E", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in variables
+    ]
+
+
+def input_at_stages(degree: int, substeps: int) -> Assignments:
+    """``V_A``, ``V_B``, ``V_D``: the input at the start, middle and end of a Runge-Kutta step, by its polynomial."""
+    h = sp.Rational(1, substeps)
+    lines = []
+    for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
+        value: sp.Expr = symbol(f"U_{degree}")
+        if degree:
+            lines.append((f"T_{tag}", symbol("T") + fraction * h))
+        for k in range(degree - 1, -1, -1):
+            value = symbol(f"U_{k}") + symbol(f"T_{tag}") * value
+        lines.append((f"V_{tag}", value))
+    return lines
+
+
+def state_rk4_step(model: Model, degree: int) -> Assignments:
+    """One Runge-Kutta step of the state alone."""
+    at = {symbol(i): symbol(f"M_{i}") for i in model.states}
+    rates = {f"K_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
+    stages = runge_kutta_4(
+        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "W"), model.substeps
+    )
+    return input_at_stages(degree, model.substeps) + stages
+
+
+def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:
+    """Assignments of the state alone over a sample, or over a Runge-Kutta step of it, of renamed quantities.
+
+    Returns:
+        The assignments, and what each of the renamed states becomes.
+    """
+    if model.is_continuous:
+        mapping = {**row_of, **{f"M_{x}": row_of[x] for x in model.states}}
+        lines = substitute(state_rk4_step(model, degree), mapping)
+        return lines, {row_of[x]: f"M_{x}_E" for x in model.states}
+    lines, propagation = propagate_difference_equation(model)
+    results = {}
+    for x, value in zip(model.states, propagation.state, strict=True):
+        lines.append((f"NEXT_{x}", value))
+        results[row_of[x]] = f"NEXT_{x}"
+    return substitute(lines, row_of), results
+
+
+def input_at_end(model: Model, degree: int) -> sp.Expr:
+    """The input that a sensor sees: the newest tap, or the polynomial's value at the end of the sample."""
+    return sum((symbol(f"U_{k}") for k in range(degree + 1)), sp.S.Zero) if model.is_continuous else symbol("U_0")
+
+
+def reverse_mode_derivative(
+    assignments: Assignments, inputs: Sequence[str], result_adjoints: Mapping[str, str]
+) -> Assignments:
+    """The reverse derivative of assignments: adjoints ``G_<name>`` of ``inputs``, from those of the results.
+
+    Args:
+        assignments: forward, each name assigned once.
+        inputs: names whose adjoints are asked for.
+        result_adjoints: result to the name that holds its adjoint.
+
+    Returns:
+        Assignments to run after the forward ones; those of ``inputs`` come last, as ``G_<name>``.
+    """
+    if len({name for name, _ in assignments}) < len(assignments):
+        raise ValueError("assignments must assign every name once, to be reversed")
+    adjoints: dict[str, list[sp.Expr]] = {name: [symbol(seed)] for name, seed in result_adjoints.items()}
+    lines: Assignments = []
+    for name, expression in reversed(assignments):
+        parts = adjoints.pop(name, None)
+        if parts is None:
+            continue
+        adjoint = symbol(f"G_{name}")
+        lines.append((str(adjoint), sum(parts, sp.S.Zero)))
+        inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
+        for used in sorted(expression.free_symbols, key=str):
+            # The slope of 1/x needs no further division.
+            slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
+            adjoints.setdefault(str(used), []).append(slope * adjoint)
+    lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]
+    return lines

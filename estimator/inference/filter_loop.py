@@ -1,0 +1,256 @@
+"""One compiled function that takes samples, for any model: the loop of the online estimator.
+
+A block ``W`` holds one system, or `LANES` hypotheses about the noises of one. Each sample lets the coefficients walk,
+puts the inputs into their rows, updates, and judges every member by its free energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from estimator.compilation.simd import LANES, jit_closure, kernel
+from estimator.engine import kernels
+from estimator.engine.source_cache import variant_digest
+from estimator.engine.storage_layout import belief_rows
+from estimator.engine.variational_free_energy import compile_free_energies
+from estimator.inference import mean_field
+from estimator.inference.noise_mixture import apply_switching, forecast_mixture, mark_diverged, reweight
+from estimator.models.difference_equation import difference
+from estimator.models.model import Model
+
+
+@dataclass(frozen=True)
+class FilterLoop:
+    """A compiled loop over samples, and its block.
+
+    Attributes:
+        run: ``run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts)``, which
+            returns -1, or the number of the sample at which the numbers overflowed; then nothing has changed.
+
+            - W: (blocks, rows * lanes), the members' systems one after the other.
+            - backup: (blocks, record * lanes), memory.
+            - weights: (members,) of the hypotheses.
+            - begun: (1,) 0 before the first sample ever.
+            - inputs: those that still act, then a new one for each sample; the former are moved on.
+            - outputs: (samples, sensors), with the one that waits in front; NaN where missing.
+            - stencil: of `estimator.inference.input_interpolation.InputStencil`.
+            - steps: its stride, past, waits and fills, as int64.
+            - walk: (K,) variances of the coefficients' random walk per sample.
+            - energies: (samples, iterations) receives the free energies [nats]; where it is empty nothing is judged.
+            - forecasts: (samples, sensors, 2) receives mean and variance of each output before it was seen.
+        layout: rows of the block.
+        lanes: systems in a block.
+    """
+
+    run: Any
+    layout: Mapping[str, int]
+    lanes: int
+
+
+@cache
+def compile_structured_loop(
+    model: Model, degree: int, iterations: int, expectations: str = "first_order", members: int = 1
+) -> FilterLoop:
+    """The structured factorisation, with a lane for each member where there are several."""
+    lanes = 1 if members == 1 else LANES
+    belief_update = kernels.compile_belief_update(
+        model,
+        degree,
+        iterations=iterations,
+        lanes=lanes,
+        keep_trace=True,
+        may_be_missing=True,
+        expectations=expectations,
+    )
+    layout, update = belief_update.layout, belief_update.update
+    energies_of = compile_free_energies(model, iterations, lanes, layout)
+    variant = f"{model.name}_{variant_digest(model.digest, degree, iterations, lanes, expectations)}"
+    unsound = layout.get("UNSOUND", -1) * lanes
+
+    @jit_closure(variant)
+    def update_block(W, before):
+        if unsound >= 0:
+            for j in range(lanes):
+                W[unsound + j] = 0.0
+        update(W)
+        energies_of(W, before)
+
+    sensors = model.n_outputs
+    means = tuple(layout[f"TRACE_{k}_mean"] * lanes for k in range(sensors))
+    variance_parts = tuple(
+        tuple(
+            layout[f"TRACE_{k}_{what}"] * lanes for what in ("variance", f"q_{iterations - 1}", f"r_{iterations - 1}")
+        )
+        for k in range(sensors)
+    )
+
+    @jit_closure(variant)
+    def score_member(W, j, before, values, forecasts):
+        for i in range(iterations):
+            values[i] = np.nan if unsound >= 0 and W[unsound + j] > 0.0 else before[i * lanes + j]
+        for k in range(sensors):
+            forecasts[k, 0] = W[means[k] + j]
+            forecasts[k, 1] = W[variance_parts[k][0] + j] + W[variance_parts[k][1] + j] + W[variance_parts[k][2] + j]
+
+    return FilterLoop(
+        _compile_loop(variant, model, layout, lanes, iterations * lanes, update_block, score_member), layout, lanes
+    )
+
+
+@cache
+def compile_mean_field_loop(iterations: int, as_published: bool) -> FilterLoop:
+    """The paper's mean field, with or without the departures of the published run. It makes no forecasts."""
+    model = difference()
+    layout = mean_field.mean_field_layout()
+    begin, iterate, end, energy = mean_field.compile_mean_field(layout, lanes=1)
+    variant = f"mean_field_{variant_digest(model.digest, iterations, as_published)}"
+
+    @jit_closure(variant)
+    def update_block(W, before):
+        begin(W)
+        for i in range(iterations):
+            iterate(W, as_published)
+            before[i] = energy(W, 0)
+        end(W)
+
+    @jit_closure(variant)
+    def score_member(W, j, before, values, forecasts):
+        for i in range(iterations):
+            values[i] = before[i]
+        forecasts[0, 0] = forecasts[0, 1] = np.nan
+
+    return FilterLoop(_compile_loop(variant, model, layout, 1, iterations, update_block, score_member), layout, 1)
+
+
+def _compile_loop(
+    variant: str,
+    model: Model,
+    layout: Mapping[str, int],
+    lanes: int,
+    scratch: int,
+    update_block: Any,
+    score_member: Any,
+) -> Any:
+    """The loop of `FilterLoop.run` around an update ``update_block(W, before)`` and its ``score_member(W, j, before, values, forecasts)``.
+
+    Args:
+        variant: names the compiled code; see `estimator.compilation.simd.jit_closure`.
+        model: whose rows.
+        layout: of the rows.
+        lanes: systems in a block.
+        scratch: numbers that ``update_block`` leaves in ``before`` for ``score_member``.
+        update_block: updates a block.
+        score_member: free energies and forecasts of a lane.
+    """
+    u_row = layout["U_0"] * lanes
+    y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
+    walks = tuple(layout[f"P_{c}_{c}"] * lanes for c in model.coefficients)
+    sensors, is_single = model.n_outputs, lanes == 1
+    record_length = len(belief_rows(model)) * lanes
+
+    @jit_closure(variant)
+    def load_sample(W, inputs, start, window, stencil, output, walk, changes):
+        if changes:
+            for c in range(len(walks)):
+                for j in range(lanes):
+                    W[walks[c] + j] += walk[c]
+        for i in range(len(stencil)):
+            value = 0.0
+            for w in range(window):
+                value += inputs[start + w] * stencil[i, w]
+            for j in range(lanes):
+                W[u_row + i * lanes + j] = value
+        for k in range(sensors):
+            for j in range(lanes):
+                W[y_row + k * lanes + j] = output[k]
+
+    @jit_closure(variant)
+    def copy_beliefs(kept, blocks):
+        """Copy the beliefs in some blocks to others."""
+        for b in range(len(blocks)):
+            for i in range(record_length):
+                kept[b, i] = blocks[b, i]
+
+    @kernel(variant=variant)
+    def run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
+        stride, past, waits, fills = steps[0], steps[1], steps[2], steps[3]
+        members, samples, iterations = len(weights), len(outputs) - waits, energies.shape[1]
+        judged = energies.shape[0] > 0
+        window, changes = stencil.shape[1], walk[0] > 0.0
+        for c in range(1, len(walks)):
+            changes = changes or walk[c] > 0.0
+        before = np.empty(scratch)
+        single, shares = np.empty((members, iterations)), np.empty((members, iterations))
+        predictions = np.empty((members, sensors, 2))
+        old_weights = np.empty(members)
+        for m in range(members):
+            old_weights[m] = weights[m]
+        first = 1 if waits and begun[0] == 0.0 else 0
+        if fills and begun[0] == 0.0:
+            for i in range(past):
+                inputs[i] = inputs[past]
+        copy_beliefs(backup, W)
+        bad = -1
+        for t in range(first, samples):
+            for b in range(len(W)):
+                load_sample(W[b], inputs, t * stride, window, stencil, outputs[t], walk, changes)
+                update_block(W[b], before)
+                for j in range(min(lanes, members - b * lanes)):
+                    m = b * lanes + j
+                    score_member(W[b], j, before, single[m], predictions[m])
+            here = t - first
+            if is_single or not judged:
+                for k in range(sensors):
+                    forecasts[here, k, 0], forecasts[here, k, 1] = predictions[0, k, 0], predictions[0, k, 1]
+            else:
+                for m in range(members):
+                    mark_diverged(single[m], predictions[m])
+                    for i in range(iterations):
+                        shares[m, i] = weights[m]
+                apply_switching(shares, single)
+                forecast_mixture(shares, predictions, forecasts[here])
+                reweight(shares, single, energies[here])
+                for m in range(members):
+                    weights[m] = shares[m, iterations - 1]
+            if not judged:
+                continue
+            whole = True
+            for i in range(iterations):
+                if is_single:
+                    energies[here, i] = single[0, i]
+                whole = whole and np.isfinite(energies[here, i])
+            if not whole:
+                bad = t
+                break
+        if judged and bad < 0 and samples > first:
+            # What the last sample left is seen by no later free energy.
+            whole = False
+            for m in range(members):
+                finite = weights[m] > 0.0
+                for i in range(m % lanes, record_length, lanes):
+                    finite = finite and np.isfinite(W[m // lanes, i])
+                whole = whole or finite
+            if not whole:
+                bad = samples - 1
+        if bad >= 0:
+            copy_beliefs(W, backup)
+            for m in range(members):
+                weights[m] = old_weights[m]
+            if fills and begun[0] == 0.0:
+                for i in range(past):
+                    inputs[i] = 0.0
+            return bad
+        for i in range(past):
+            inputs[i] = inputs[i + samples]
+        for i in range(waits):
+            for k in range(sensors):
+                outputs[i, k] = outputs[i + samples, k]
+        begun[0] = 1.0
+        return bad
+
+    return run

@@ -1,0 +1,121 @@
+"""Free runs: what a plant with given coefficients does with an input, without noise; and what its sensor shows."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import kernel, number_rows
+from estimator.engine import source_cache as stored
+from estimator.engine.input_hold import compile_input_writer, input_degree
+from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.storage_layout import input_rows
+from estimator.models.model import Model
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import FloatArray
+
+
+def free_run(
+    model: Model,
+    coefficients: npt.ArrayLike,
+    u: npt.ArrayLike,
+    state: npt.ArrayLike | None = None,
+    interpolation: str = "zero_order",
+) -> FloatArray:
+    """What the first sensor shows over a series of inputs; of one system, or of S at once.
+
+    Args:
+        model: the equation.
+        coefficients: (K,) or (S, K), time counted in samples.
+        u: (T,) or (S, T) inputs; the t-th acts over the sample that ends with the t-th output. Before the first there
+            was none.
+        state: (n,) or (S, n) where it starts; at rest where it is None.
+        interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
+
+    Returns:
+        (T,) outputs, or (S, T) where any argument is of S systems; inf or NaN from where the model blows up.
+
+    Raises:
+        ValueError: for shapes that do not fit, or what is no numbers.
+    """
+    values, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
+    start = np.zeros(model.n_states) if state is None else to_float_array("state", state)
+    systems = {len(given) for given in (values, inputs, start) if given.ndim == 2}
+    is_odd = len(systems) > 1 or any(given.ndim not in (1, 2) for given in (values, inputs, start))
+    if is_odd or values.shape[-1] != model.n_coefficients or start.shape[-1] != model.n_states:
+        raise ValueError(
+            f"coefficients, u and state must have shapes {(model.n_coefficients,)}, (T,) and {(model.n_states,)}, or "
+            f"one more axis, of systems, but have {values.shape}, {inputs.shape} and {start.shape}"
+        )
+    starts = np.empty((*systems, model.n_states + model.n_coefficients))
+    starts[..., : model.n_states], starts[..., model.n_states :] = start, values
+    inputs = np.broadcast_to(inputs, (*systems, inputs.shape[-1])).copy()
+    outputs = np.empty_like(inputs)
+    run, _ = _compile_free_run(model, input_degree(model, interpolation))
+    run(np.atleast_2d(starts), np.atleast_2d(inputs), np.atleast_2d(outputs))
+    return outputs
+
+
+def output_at(model: Model, coefficients: FloatArray, state: FloatArray, u: float) -> float:
+    """What the first sensor shows at a state, under an input that has been on for a while.
+
+    Args:
+        model: the equation.
+        coefficients: (K,), time counted in samples.
+        state: (n,).
+        u: the input, which an accelerometer feels at once.
+    """
+    _, output_of = _compile_free_run(model, 0)
+    return float(output_of(np.concatenate([state, coefficients]), float(u)))
+
+
+@cache
+def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
+    """``run(starts, u, y)`` of S systems and ``output_of(start, u)`` of one; a start holds states and coefficients."""
+    layout = number_rows(*model.names, *input_rows(model, degree), "SHOWN")
+
+    def make() -> str:
+        from estimator.engine import printer_numba, symbolic
+
+        lines, results = symbolic.propagate_state(model, degree, {name: name for name in model.names})
+        uniform = ("T",) if model.is_continuous else ()
+        source = printer_numba.print_lane_loop("move", lines, results, layout, 1, uniform, doc="The state moves.")
+        end = symbolic.input_at_end(model, degree)
+        shown = symbolic.substitute([("", symbolic.differentiate(model).outputs[0])], {"u": end})[0][1]
+        return source + printer_numba.print_lane_loop(
+            "sense", [("S", shown)], {"SHOWN": "S"}, layout, 1, doc="The sensor."
+        )
+
+    code = stored.load_generated(model.name, "free-run", repr((model.digest, degree)), make, RUNTIME_FUNCTIONS)
+    move, sense, size, steps, n = code.move, code.sense, len(layout), model.substeps, len(model.names)
+    shown, continuous = layout["SHOWN"], model.is_continuous
+    feed = compile_input_writer(model, degree, [layout[row] for row in input_rows(model, degree)], 1)
+
+    @kernel(variant=f"{model.name}_{model.digest}_{degree}")
+    def run(starts, u, y):
+        W = np.zeros(size)
+        for i in range(len(starts)):
+            copy(W, 0, starts[i], n)
+            for t in range(u.shape[1]):
+                feed(W, 0, u[i, t], u[i, t - 1] if t > 0 else 0.0, u[i, t - 2] if t > 1 else 0.0)
+                if continuous:
+                    for s in range(steps):
+                        move(W, s / steps)
+                else:
+                    move(W)
+                sense(W)
+                y[i, t] = W[shown]
+
+    @kernel(variant=f"{model.name}_{model.digest}_{degree}")
+    def output_of(start, u):
+        W = np.zeros(size)
+        copy(W, 0, start, n)
+        feed(W, 0, u, u, u)
+        sense(W)
+        return W[shown]
+
+    return run, output_of
