@@ -15,6 +15,7 @@ from typing import Any
 import griffe
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from agents import POLICIES
 from agents.leaderboard import leaderboard_file
@@ -22,7 +23,7 @@ from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS
 from duffing_env.rewards import reward_registry
 
-#: What docs/*.md point to in the repository, to the page that is made of it.
+#: A file of the repository that pages link to, to the page that is made of it.
 MADE_OF = {
     "duffing_env/tracks/track_registry.py": "tracks/index.md",
     "duffing_env/rewards/reward_registry.py": "rewards.md",
@@ -62,8 +63,9 @@ REFERENCE = {
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the tracks into the menu."""
-    section = next(entry["Tracks"] for entry in config.nav if "Tracks" in entry)
-    section += [{_title(track): _page(track)} for track in TRACKS]
+    environments = next(entry["Environments"] for entry in config.nav if "Environments" in entry)
+    tracks = next(entry["Tracks"] for entry in environments if "Tracks" in entry)
+    tracks += [{_title(track): _page(track)} for track in TRACKS]
     return config
 
 
@@ -82,13 +84,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Show sessions as such, and point to the pages that are made here.
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Mark sessions as such, and link to the pages that are made here.
 
-    A reader of the file itself is served better by ``python``, and by the code that such a page is made of.
+    In the repository itself ``python``, and a link to the code that such a page is made of, serve a reader better.
     """
-    for source, page in MADE_OF.items():
-        markdown = markdown.replace(f"](../{source})", f"]({page})")
+    up = "../" * page.file.src_uri.count("/")
+    for source, made in MADE_OF.items():
+        markdown = markdown.replace(f"]({up}../{source})", f"]({up}{made})")
     return markdown.replace("```python\n>>>", "```pycon\n>>>")
 
 
@@ -160,9 +163,10 @@ def _policies() -> str:
         rows.append(f"| `{name}` | {_first_line(function)}{f' ({call})' if call else ''} |")
     return "\n".join(
         [
-            "# Policies",
+            "# Policies by name",
             "",
-            "A policy chooses the input. All have `predict` of Stable-Baselines3, and are made by name.",
+            "A policy chooses the input. All have `predict` of Stable-Baselines3, and are made by name; "
+            "[policies](../policies.md) describes them.",
             "",
             "| Name | |",
             "|---|---|",

@@ -1,4 +1,4 @@
-"""Whether an environment's 90 % intervals hold the truth where nobody knows the noises; docs/coverage.md has figures.
+"""Whether an environment's 90 % intervals hold the truth with unknown noises; docs/evidence/coverage.md has figures.
 
 ``pytest -m slow -s tests/duffing_env/test_coverage_of_hypotheses.py`` prints them.
 """
@@ -47,6 +47,6 @@ def test_with_priors_at_a_third_and_three_times_the_truth_they_do(track):
 @pytest.mark.slow
 @pytest.mark.parametrize("track", TRACKS)
 def test_where_the_truth_is_between_the_levels_they_are_too_narrow(track):
-    # docs/coverage.md names this as a limit: three levels of the noises' sum are coarse.
+    # docs/evidence/coverage.md names this as a limit: three levels of the noises' sum are coarse.
     cells = [(1 / 3, 1.0), (1.0, 1 / 3), (1 / 3, 3.0), (3.0, 1 / 3)]
     assert np.mean([shown(track, 9, **guessed(*cell)) for cell in cells]) < 0.87

@@ -38,6 +38,6 @@ def test_two_amplitudes_of_a_sine_tell_what_one_leaves_open(tmp_path):
 
 
 def test_the_manual_has_the_answer_to_every_case():
-    page = (Path(__file__).parents[2] / "docs" / "cases.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "evidence" / "cases.md").read_text(encoding="utf-8")
     rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
     assert rows[1:] == [[str(case), case.answer, case.then] for case in CASES]

@@ -17,7 +17,7 @@ from research.studies import kouw2020 as module
 from research.studies.kouw2020 import PUBLISHED, SETTINGS, prediction_mse, reproduce, simulation_mse
 
 ROOT = Path(__file__).parents[2]
-MANUAL = ROOT / "docs" / "reproduction.md"
+MANUAL = ROOT / "docs" / "evidence" / "reproduction.md"
 FEM = ("FEM-LARX", "FEM-NLARX")
 
 

@@ -17,7 +17,7 @@ from research.studies import silverbox_results as reporting
 from research.studies.silverbox_protocol import N_GIVEN_OUTPUTS, SETTINGS, TESTS, ProtocolOutcome
 
 ROOT = Path(__file__).parents[2]
-MANUAL = ROOT / "docs" / "silverbox.md"
+MANUAL = ROOT / "docs" / "evidence" / "silverbox.md"
 
 
 # --- Slices and measures by hand -----------------------------------------------------------------------------------

@@ -121,7 +121,7 @@ def test_it_never_rises_and_bounds_the_surprise():
         assert np.diff(out).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
         evidence, error = density.mean(), density.std() / np.sqrt(draws)
         assert out[-1] >= -np.log(evidence) - 5 * error / evidence
-    # With equal priors E[w²] = E[v²] for every sample, so that E[γ] = E[ξ] for ever: docs/coverage.md.
+    # With equal priors E[w²] = E[v²] for every sample, so that E[γ] = E[ξ] for ever: docs/evidence/coverage.md.
     W = updated(case, task, [(replace(belief, xi=[belief.gamma]), *rest) for belief, *rest in samples])
     for lane, (belief, *_) in enumerate(samples):
         after = get_belief(W, task.layout, LANES, lane, case)

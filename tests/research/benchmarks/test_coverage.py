@@ -65,7 +65,7 @@ def test_intervals_of_every_model_hold_the_truth(population):
     ids=["mean field", "noise priors too small", "noise priors too large", "first order of a wide prior"],
 )
 def test_where_the_manual_says_that_they_do_not(case):
-    # docs/coverage.md names these as limits; and the check above can fail.
+    # docs/evidence/coverage.md names these as limits; and the check above can fail.
     result = evaluate(case, 120, 0)
     with pytest.raises(AssertionError):
         assert_calibrated(result)
