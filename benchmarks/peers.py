@@ -123,7 +123,7 @@ def row(name: str) -> Run:
     ``rigs`` and what `benchmarks.rigs.peer_methods.row` takes.
     """
     kind, _, rest = name.partition(" ")
-    modules = {"silverbox": ("silverbox_peer_filters", ""), "rigs": ("peer_rows", "rigs")}
+    modules = {"silverbox": ("silverbox_peer_filters", ""), "rigs": ("peer_methods", "rigs")}
     if kind in modules:
         module, folder = modules[kind]
         sys.path.append(str(Path(__file__).parent / folder))

@@ -20,7 +20,7 @@ from estimator.rigs.rig_prior import rig_prior
 from estimator.settings import EstimatorSettings, checked_settings
 from estimator.support.argument_checks import to_finite_series, to_scalar
 from estimator.support.array_types import FloatArray
-from estimator.support.progress import show_progress as shown
+from estimator.support.progress import show_progress
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
 
@@ -326,7 +326,7 @@ class OnlineEstimator:
         if not progress or self._filter.input_stencil.needs_whole_record:
             yield 0, samples
             return
-        with shown("Identifying") as report:
+        with show_progress("Identifying") as report:
             for start in range(0, samples, _SAMPLES_BETWEEN_REPORTS):
                 report(start / samples)
                 yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)

@@ -84,7 +84,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
                 "name": record.name,
                 "samples": len(record.u),
                 "step": record.step or result.rig.step,
-                "missing": record.missing,
+                "missing": record.n_missing,
                 "clipped": record.n_clipped,
             }
             for record in result.records

@@ -63,19 +63,24 @@ def rig_text_from_record(
     if step is None:
         # Times are written with some digits, and their mean difference is off by the last of them.
         step = float(f"{step_of_times:.6g}")
-        step_source = f"the times in {table.names[table.time or 0]:.60}" if table.names else "the first column"
+        step_source = f"the times in {table.names[table.time_column or 0]:.60}" if table.names else "the first column"
     sentences = [_sampling_step_sentence(step, step_source)]
-    input_unit, output_unit = (None if place is None else table.unit(place) for place in (table.u, table.y))
+    input_unit, output_unit = (
+        None if place is None else table.unit(place) for place in (table.input_column, table.output_column)
+    )
     # A name that says nothing was taken by its place, and stands in the file to be seen.
     column_names = [
-        None if place is None or table.has_known_name(place) else table.names[place] for place in (table.u, table.y)
+        None if place is None or table.has_known_name(place) else table.names[place]
+        for place in (table.input_column, table.output_column)
     ]
     # A g of an input may be one of weight.
     si_units = [
         one if one in (None, "g") and k == 0 else to_si_unit(one or "1")[1]
         for k, one in enumerate((input_unit, output_unit))
     ]
-    output = Channel(si_units[1] or "1", kind=table.kind() or "displacement", column=output_column or column_names[1])
+    output = Channel(
+        si_units[1] or "1", kind=table.output_kind() or "displacement", column=output_column or column_names[1]
+    )
     rig = Rig(step, input=Channel(si_units[0] or "1", column=input_column or column_names[0]), output=output)
     for name, one, base in zip(("input", "output"), (input_unit, output_unit), si_units, strict=True):
         if one and base and conversion_factor(one, base) != 1.0:

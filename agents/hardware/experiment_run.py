@@ -204,7 +204,7 @@ def _prior_conflict_warning(rig: Rig, belief: Belief, samples_path: Path) -> str
         if sum(1 for _ in lines) <= _MIN_OUTPUTS_FOR_NOISE:
             return ""
     table = read_table(samples_path, rig.input.column, rig.output.column)
-    u, y = table.inputs, table.columns[table.y]
+    u, y = table.inputs, table.columns[table.output_column]
     if np.isfinite(y).sum() < _MIN_OUTPUTS_FOR_NOISE:
         return ""
     warning = disturbance_message(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance_std(belief))

@@ -62,8 +62,8 @@ def identify_from_files(
         started = time.perf_counter()
         try:
             result = identify(Rig.from_file(str(rig_file)), [str(data_file) for data_file in data_files])
-        except Exception as error:  # whatever a user would meet
-            failed = f"{type(error).__name__}: {error}"
+        except Exception as failure:  # whatever a user would meet
+            failed = f"{type(failure).__name__}: {failure}"
             return TrialOutcome([np.inf] * 4, [np.nan] * 4, [False] * 4, bound.tolist(), failure=failed)
         seconds = time.perf_counter() - started
     error, std, inside = compare_to_truth(result.parameters, result.interval(INTERVAL_PROBABILITY), truth)

@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pprint import pprint
 from typing import Any
 
 import numpy as np
@@ -196,7 +197,7 @@ def print_report(runs: dict[tuple[str, str, str], list[LoopOutcome]]) -> dict[st
               "times narrower", "left its range", "refused")  # fmt: skip
     console_output.print_texts_and_tables(console_output.format_table(titles, rows, markdown=True))
     verdicts = {way: judge_mode(runs, way) for way in dict.fromkeys(way for *_, way in runs)}
-    console_output.print_texts_and_tables(verdicts, width=175)
+    pprint(verdicts, width=175)
     return verdicts
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pprint import pprint
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,8 @@ def run_trial(task: tuple[str, str, int, int]) -> ExperimentOutcome:
     result = identify(rig, [*records, (u, y)])
     truth = np.array(bench.truth)
     error, std, inside = compare_to_truth(result.parameters, result.interval(INTERVAL_PROBABILITY), truth)
-    before = np.array([found.before.parameters()[p][1] for p in PARAMETERS])
-    expected = np.array([found.after[p] for p in PARAMETERS])
+    before = np.array([found.prior.parameters()[p][1] for p in PARAMETERS])
+    expected = np.array([found.expected_stds[p] for p in PARAMETERS])
     return ExperimentOutcome(
         *((np.asarray(stds) / np.abs(truth)).tolist() for stds in (before, expected, std)),
         error.tolist(), inside.tolist(), bool((np.abs(y) > bench.output_range).any()),
@@ -99,5 +100,5 @@ def print_report(found: dict[tuple[str, str], list[ExperimentOutcome]]) -> dict[
         "of": len(every),
         "at most, with 95 %": binomial_interval(left, len(every), 0.9)[1],
     }
-    console_output.print_texts_and_tables(verdict, width=170)
+    pprint(verdict, width=170)
     return verdict

@@ -26,7 +26,7 @@ _STAGES = len(_B)
 
 
 @njit(cache=True)
-def _state_derivative(tau, s, p, force, slope, out):  # type: ignore[no-untyped-def]
+def _state_derivative(tau, s, p, force, slope, out):
     """Time derivative of (x, x') and of its derivatives in the directions that ``s`` has room for."""
     m, c, a, b, q = p
     x, v = s[0], s[1]
@@ -45,7 +45,7 @@ def _state_derivative(tau, s, p, force, slope, out):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _advance_sample(s, p, force, slope, step, scale, h, K, new):  # type: ignore[no-untyped-def]
+def _advance_sample(s, p, force, slope, step, scale, h, K, new):
     """Move ``s`` over a sample; the step size to begin the next one with."""
     tau = 0.0
     n = len(s)
@@ -94,7 +94,7 @@ def _advance_sample(s, p, force, slope, step, scale, h, K, new):  # type: ignore
 
 
 @njit(cache=True)
-def _simulate(p, force, slope, initial, step, scale):  # type: ignore[no-untyped-def]
+def _simulate(p, force, slope, initial, step, scale):
     states = np.empty((len(force) + 1, 2))
     accelerations = np.empty(len(force) + 1)
     s = initial.copy()
@@ -112,7 +112,7 @@ def _simulate(p, force, slope, initial, step, scale):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def state_sensitivities(p, force, slope, states, step, scale):  # type: ignore[no-untyped-def]
+def state_sensitivities(p, force, slope, states, step, scale):
     """(T, 7, 2) derivatives of the state after each interval, from the state before it, in each of `SENSITIVITY_DIRECTIONS`.
 
     In a parameter: times the parameter, which is a derivative by its logarithm. Arguments are those of `simulate`.

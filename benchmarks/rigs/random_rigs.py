@@ -229,8 +229,8 @@ def run_trial(task: tuple[str, int]) -> IdentificationOutcome:
     begun = time.perf_counter()
     try:
         result = identify(random_rig.rig, list(random_rig.records))
-    except ValueError as error:
-        return IdentificationOutcome([math.inf] * 4, [math.inf] * 4, [False] * 4, failure=str(error))
+    except ValueError as failure:
+        return IdentificationOutcome([math.inf] * 4, [math.inf] * 4, [False] * 4, failure=str(failure))
     seconds = time.perf_counter() - begun
     truth = np.array(random_rig.truth)
     error, std, inside = compare_to_truth(result.parameters, result.interval(INTERVAL_PROBABILITY), truth)

@@ -75,7 +75,7 @@ class SimulatedRecord:
 @njit(cache=True)
 def fisher_information(
     sensitivities, output_by_state, output_by_force, output_by_unknown, process_variance, sensor_variance, initial_std
-):  # type: ignore[no-untyped-def]
+):
     """Fisher information of P unknowns, of which the four parameters come first.
 
     Args:
@@ -181,7 +181,7 @@ def draw_guess(bench: Bench, seed: int) -> dict[str, tuple[float, float]]:
     """Intervals of ±30 % about guesses that are off by up to ±30 %."""
     error_factors = 1 + rng_stream(bench, seed, "guess").uniform(-MAX_GUESS_ERROR, MAX_GUESS_ERROR, len(PARAMETERS))
     centers = dict(zip(PARAMETERS, (np.array(bench.truth) * error_factors).tolist(), strict=True))
-    return {name: tuple(sorted((0.7 * center, 1.3 * center))) for name, center in centers.items()}  # type: ignore[misc]
+    return {name: tuple(sorted((0.7 * center, 1.3 * center))) for name, center in centers.items()}
 
 
 def write_record(path: Path, u: FloatArray, y: FloatArray) -> None:

@@ -31,7 +31,7 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ignore_progress
-from estimator.support.progress import show_progress as shown
+from estimator.support.progress import show_progress
 
 
 def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: bool = False) -> Result:
@@ -82,7 +82,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     parsed_records = read_records(records, rig)
     is_free = not any(one.u.any() for one in parsed_records)
     rig = replace(rig, guess=None) if is_free else rig
-    with shown("Identifying") if progress else nullcontext(ignore_progress) as on_progress:
+    with show_progress("Identifying") if progress else nullcontext(ignore_progress) as on_progress:
         scales = _choose_scales(rig, parsed_records)
         u = tuple(one.u / scales.input for one in parsed_records)
         y = tuple(mask_unexplained_outputs(one.y, rig, MAX_UNSTATED_DELAY) / scales.output for one in parsed_records)

@@ -120,7 +120,7 @@ def _record_summary(result: Result, record: Record) -> str:
     facts = [f"{len(record.u)} samples in {seconds:.4g} s"]
     facts += [
         f"{count} outputs {what}"
-        for count, what in ((record.missing, "missing"), (record.n_clipped, "clipped"))
+        for count, what in ((record.n_missing, "missing"), (record.n_clipped, "clipped"))
         if count
     ]
     shown = f"; the first {_MAX_SHOWN_SAMPLES} are shown" if len(record.u) > _MAX_SHOWN_SAMPLES else ""

@@ -27,12 +27,12 @@ class CheckFinding:
     Attributes:
         name: of the check, such as ``"delay"``.
         message: what was found, and what to do, in plain words.
-        of: parameters that it is about, where it is about some.
+        parameters: those that it is about, where it is about some.
     """
 
     name: str
     message: str
-    of: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.name}: {self.message}"
@@ -102,7 +102,7 @@ class Result:
     @property
     def unidentified(self) -> tuple[str, ...]:
         """Parameters that the records do not identify: the check ``not_identified`` names them."""
-        return tuple(name for one in self.warnings if one.name == "not_identified" for name in one.of)
+        return tuple(name for one in self.warnings if one.name == "not_identified" for name in one.parameters)
 
     @property
     def units(self) -> dict[str, str]:

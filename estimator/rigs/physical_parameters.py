@@ -109,7 +109,7 @@ def _evaluate(function: Any, points: FloatArray, step: float) -> FloatArray:
 @cache
 def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
     """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
-    from estimator.engine import source_cache as stored
+    from estimator.engine import source_cache
 
     mapped = getattr(model, direction)
     names = list(model.coefficients if direction == "physical" else model.physical)
@@ -129,5 +129,5 @@ def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
         return source
 
     functions = {name: getattr(np, name) for name in GENERATED_FUNCTIONS}
-    code = stored.load_generated(model.name, direction, model.digest, make, functions)
+    code = source_cache.load_generated(model.name, direction, model.digest, make, functions)
     return code.values, code.slopes

@@ -80,7 +80,7 @@ def test_gaps_clipped_samples_and_several_records():
     driven[1000] = np.nan
     stop = 0.7 * np.abs(far).max()
     result = identify(rig_of(BENCH), [(u, holes), (driven, y), (pushed, np.clip(far, -stop, stop))])
-    assert [one.missing for one in result.records] == [30, 0, 0, 0]
+    assert [one.n_missing for one in result.records] == [30, 0, 0, 0]
     assert [len(one.y) for one in result.records] == [2048, 1000, 1047, 2048]
     assert [one.name for one in result.records] == ["record 0", "record 1", "record 1, from sample 1001", "record 2"]
     assert result.records[3].n_clipped == (np.abs(far) >= stop).sum()

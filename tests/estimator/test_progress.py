@@ -12,7 +12,7 @@ def clock(monkeypatch):
     """A clock that stands still until it is set."""
     at = {"now": 1000.0}
     monkeypatch.setattr(progress.time, "monotonic", lambda: at["now"])
-    monkeypatch.setattr(progress, "EVERY", 5.0)
+    monkeypatch.setattr(progress, "REPORT_INTERVAL", 5.0)
     return at
 
 

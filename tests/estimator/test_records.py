@@ -51,7 +51,7 @@ def test_files(tmp_path):
     named.write_text("# a comment\nTime [s],Force [N],Displacement [m]\n" + "\n".join(lines) + "\n")
     (one,), (other,) = (read_records(path, Rig(0.01)) for path in (plain, str(named)))
     np.testing.assert_array_equal(one.u, u)
-    assert (one.missing, other.missing) == (0, 1)
+    assert (one.n_missing, other.n_missing) == (0, 1)
     from scipy.io import savemat
 
     savemat(tmp_path / "r.mat", {"u": u, "y": y})
@@ -371,4 +371,4 @@ def test_lost_lines_and_values_over_range_are_missing(tmp_path):
     del lines[200:203]
     (tmp_path / "r.csv").write_text("\n".join(["time [s],force [N],displacement [m]", *lines]), encoding="utf-8")
     first, second = read_records(tmp_path / "r.csv", Rig(0.01))
-    assert (first.clipped, first.missing, len(first.u), len(second.u)) == (1, 0, 200, 197)
+    assert (first.n_clipped, first.n_missing, len(first.u), len(second.u)) == (1, 0, 200, 197)

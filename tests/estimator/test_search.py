@@ -13,9 +13,9 @@ REGULAR, SINGULAR = np.array([[2.0, 1.0], [1.0, 4.0]]), np.array([[1.0, 1.0], [1
 class Flat:
     """A fitter to which all ratios of the noises are alike."""
 
-    problem = SimpleNamespace(frequency=1.0, scales=SimpleNamespace(order=0))
+    problem = SimpleNamespace(mean_frequency=1.0, scales=SimpleNamespace(order=0))
 
-    def fit(self, hypotheses, start, level):
+    def fit(self, hypotheses, initial_coefficients, initial_sensor_std):
         count = len(hypotheses)
         return LaplaceFits(tuple(hypotheses), np.zeros((count, 1)), np.ones((count, 1, 1)), *np.zeros((3, count)))
 

@@ -68,7 +68,7 @@ class Record:
         u: (T,) inputs.
         y: (T,) outputs; NaN where one is missing or was clipped.
         n_clipped: outputs that were clipped, or over range.
-        missing: outputs that were not there.
+        n_missing: outputs that were not there.
         n_stale: outputs that stood still while the oscillator moved, in bursts or because each was repeated, and were
             taken out.
         n_bursts: of these.
@@ -82,7 +82,7 @@ class Record:
     u: FloatArray
     y: FloatArray
     n_clipped: int = 0
-    missing: int = 0
+    n_missing: int = 0
     n_stale: int = 0
     n_bursts: int = 0
     samples_per_value: int = 1
@@ -235,7 +235,7 @@ def _split_at_missing_inputs(record: Record) -> list[Record]:
                 u=record.u[part].copy(),
                 y=y[part].copy(),
                 n_clipped=counts[0],
-                missing=counts[1],
+                n_missing=counts[1],
                 times=times,
                 is_over_range=None,
                 n_stale=int(stale_outputs.is_stale[part].sum()),

@@ -55,9 +55,9 @@ class TextTable:
         names: of its columns, as they stand there; empty where it has numbers alone.
         columns: (C, T) numbers; NaN where one is missing.
         lines: (T,) of the file.
-        time: which column is the time; None where there is none.
-        u: which column is the input; None in a free decay.
-        y: which column is the output.
+        time_column: which column is the time; None where there is none.
+        input_column: which column is the input; None in a free decay.
+        output_column: which column is the output.
         has_timestamps: whether the times were dates or times of day, and are seconds from the first on.
     """
 
@@ -65,15 +65,19 @@ class TextTable:
     names: tuple[str, ...]
     columns: FloatArray
     lines: npt.NDArray[np.int64]
-    time: int | None
-    u: int | None
-    y: int
+    time_column: int | None
+    input_column: int | None
+    output_column: int
     has_timestamps: bool = False
 
     @property
     def inputs(self) -> FloatArray:
         """(T,) inputs; 0 where there is no column of them."""
-        return np.zeros(self.columns.shape[1]) if self.u is None else np.asarray(self.columns[self.u])
+        return (
+            np.zeros(self.columns.shape[1])
+            if self.input_column is None
+            else np.asarray(self.columns[self.input_column])
+        )
 
     def step(self) -> float | None:
         """Usual sampling step [s], of the time column; None where there is none.
@@ -83,7 +87,7 @@ class TextTable:
         Raises:
             ValueError: for times that are missing or do not grow, or in a unit that is unknown.
         """
-        if self.time is None:
+        if self.time_column is None:
             return None
         time, later = self._times_and_pairs()
         steps = time[later] - time[later - 1]
@@ -115,11 +119,13 @@ class TextTable:
 
     def _times_and_pairs(self) -> tuple[FloatArray, npt.NDArray[np.intp]]:
         """(T,) times [s], and the lines that have an input as the line before them has."""
-        assert self.time is not None
+        assert self.time_column is not None
         unit = (
-            seconds_per_time_unit(self.path, self.names[self.time]) if self.names and not self.has_timestamps else 1.0
+            seconds_per_time_unit(self.path, self.names[self.time_column])
+            if self.names and not self.has_timestamps
+            else 1.0
         )
-        time, driven = self.columns[self.time] * unit, np.isfinite(self.inputs)
+        time, driven = self.columns[self.time_column] * unit, np.isfinite(self.inputs)
         for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
                 f"{self._location(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
@@ -160,18 +166,21 @@ class TextTable:
         """Whether the name of a column says what it is; also where there are no names."""
         return not self.names or is_input_or_output(self.names[column])
 
-    def kind(self) -> str | None:
+    def output_kind(self) -> str | None:
         """What the name of the output, or else its unit, says that it is: a displacement, for one; or None.
 
         Raises:
             ValueError: where name and unit say different things.
         """
-        word, unit = first_word(self.names[self.y]) if self.names else "", self.unit(self.y) or ""
+        word, unit = (
+            first_word(self.names[self.output_column]) if self.names else "",
+            self.unit(self.output_column) or "",
+        )
         named = next((kind for kind, words in WORDS_OF_SENSOR_KIND.items() if word in words), None)
         told = sensor_kind_of_unit(unit)
         if named and told and named != told:
             raise ValueError(
-                f"{self.path}: unit of {self.names[self.y]!r:.60} must be of a kind with the name, {named}, but tells "
+                f"{self.path}: unit of {self.names[self.output_column]!r:.60} must be of a kind with the name, {named}, but tells "
                 f"{told}; mend one of them"
             )
         return named or told
@@ -183,18 +192,18 @@ class TextTable:
             ValueError: naming the column, for the unit of another quantity, or another kind of output. A pure number,
                 1, contradicts nothing.
         """
-        word = first_word(self.names[self.y]) if self.names else ""
+        word = first_word(self.names[self.output_column]) if self.names else ""
         kind = next(
             (one for one, words in WORDS_OF_SENSOR_KIND.items() if word in words and len(word) > 1), output_channel.kind
         )
         if kind != output_channel.kind:
             raise ValueError(
-                f"{self.path}: {self.names[self.y]!r:.60} must be the rig's kind of output, {output_channel.kind}, but is called "
+                f"{self.path}: {self.names[self.output_column]!r:.60} must be the rig's kind of output, {output_channel.kind}, but is called "
                 f"{kind}; mend one of them"
             )
-        return self.inputs * self._unit_factor(self.u, input_channel), self.columns[self.y] * self._unit_factor(
-            self.y, output_channel
-        )
+        return self.inputs * self._unit_factor(self.input_column, input_channel), self.columns[
+            self.output_column
+        ] * self._unit_factor(self.output_column, output_channel)
 
     def _unit_factor(self, column: int | None, channel: Channel) -> float:
         """From the unit of a column to that of its channel; 1 where one of them says none."""

@@ -198,7 +198,7 @@ def _restart_and_settle(fitter: LaplaceFitter, first_result: SearchResult) -> Se
         random_fits = _fit_random_starts(fitter, seed)
         for k in range(len(random_fits.mean)):
             with suppress(ValueError):  # it ran away
-                results.append(_settle_best_start(fitter, random_fits.where(np.array([k]))))
+                results.append(_settle_best_start(fitter, random_fits.select(np.array([k]))))
             results.sort(key=energy)
             is_same_optimum = len(results) > 1 and energy(results[1]) < energy(results[0]) + _SAME_OPTIMUM_NATS
             if is_same_optimum or results[0].relative_disturbance < _MAX_GOOD_DISTURBANCE:
@@ -282,14 +282,14 @@ def _fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
     points = np.repeat(np.array([*candidates, *candidates]), len(_INITIAL_NOISE_RATIOS), axis=0)
     hypotheses = [h for one in resting for h in with_noise_ratios(one, ratios)]
     for steps, kept in _FIRST_SEARCH_STAGES:
-        fits = short_fitter.fit(hypotheses, points, sensor_std, steps).best(kept)
+        fits = short_fitter.fit(hypotheses, points, sensor_std, steps).lowest_free_energy(kept)
         hypotheses, points, sensor_std = list(fits.hypotheses), fits.mean, fits.sensor_std
     if short_fitter.problem.n_observed_outputs < problem.n_observed_outputs and np.isfinite(fits.free_energy).any():
         # The first periods may tell little of a coefficient, which then is anywhere: all records judge.
         points = np.array([*fits.mean, *candidates])
-        fits = fitter.fit(list(fits.hypotheses) * len(points), points, fits.sensor_std[0], _CONFIRMING_FIT_STEPS).best(
-            1
-        )
+        fits = fitter.fit(
+            list(fits.hypotheses) * len(points), points, fits.sensor_std[0], _CONFIRMING_FIT_STEPS
+        ).lowest_free_energy(1)
     return fits if np.isfinite(fits.free_energy).any() else _fit_random_starts(fitter)
 
 
@@ -318,11 +318,7 @@ def _fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
             )
             samples *= _SEGMENT_GROWTH
         found.append(fits)
-    names = ("mean", "cov", "sensor_std", "free_energy", "loss")
-    both = (np.concatenate([getattr(fits, name) for fits in found]) for name in names)
-    return _fit_from_initial_states(
-        fitter, LaplaceFits(tuple(h for fits in found for h in fits.hypotheses), *both), ratios, _N_KEPT_STARTS[2]
-    )
+    return _fit_from_initial_states(fitter, LaplaceFits.concatenated(found), ratios, _N_KEPT_STARTS[2])
 
 
 def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: FloatArray, n_kept: int) -> LaplaceFits:
@@ -337,13 +333,13 @@ def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: F
     points, levels = np.repeat(fits.mean, len(ratios), axis=0), np.repeat(fits.sensor_std, len(ratios))
     tried = fitter.fit(hypotheses, points, levels, _RESTART_FIT_STEPS)
     of_each = tried.free_energy.reshape(-1, len(ratios)).argmin(axis=1)
-    return _distinct_optima(tried.where(len(ratios) * np.arange(len(of_each)) + of_each), n_kept)
+    return _distinct_optima(tried.select(len(ratios) * np.arange(len(of_each)) + of_each), n_kept)
 
 
 def _distinct_optima(fits: LaplaceFits, max_count: int) -> LaplaceFits:
     """The best of those that did not come to the same."""
-    finite = fits.where(np.isfinite(fits.free_energy))
-    return finite.where(np.unique(np.round(finite.free_energy), return_index=True)[1][:max_count])
+    finite = fits.select(np.isfinite(fits.free_energy))
+    return finite.select(np.unique(np.round(finite.free_energy), return_index=True)[1][:max_count])
 
 
 def required_substeps(problem: IdentificationProblem, mean: FloatArray, cov: FloatArray) -> int:
@@ -409,7 +405,7 @@ def fit_noise_ratio(
             break
         width = np.clip(_GRID_REACH_STDS * std, width / 40, width / 2)
     has_weight = weights > 1e-6
-    return SearchResult(fits.where(has_weight), weights[has_weight] / weights[has_weight].sum(), fitter)
+    return SearchResult(fits.select(has_weight), weights[has_weight] / weights[has_weight].sum(), fitter)
 
 
 def _parabola_moments(places: FloatArray, energies: FloatArray, best: int) -> tuple[float, float]:

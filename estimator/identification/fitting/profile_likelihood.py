@@ -191,7 +191,7 @@ class _RidgeWalk:
         fits = self.fitter.fit(
             hypotheses, np.repeat(ahead, n, axis=0), levels, iterations, fixed_directions=np.repeat(slopes, n, axis=0)
         )
-        return fits.where(np.arange(len(walks)) * n + _finite_losses(fits).reshape(-1, n).argmin(axis=1))
+        return fits.select(np.arange(len(walks)) * n + _finite_losses(fits).reshape(-1, n).argmin(axis=1))
 
     def walk_outward(self, lowest_loss: float) -> tuple[LaplaceFits, npt.NDArray[np.intp]]:
         """Go until the records lose enough; all that was fitted on the way, and the number of the walk of each."""
@@ -206,8 +206,8 @@ class _RidgeWalk:
             kept, length = active[is_accepted], self.step_length[active]
             numbers = rows.copy()
             numbers[kept] = len(rows) + np.flatnonzero(is_accepted)
-            self.current = LaplaceFits.concatenated([self.current, found]).where(numbers)
-            steps.append(found.where(is_accepted))
+            self.current = LaplaceFits.concatenated([self.current, found]).select(numbers)
+            steps.append(found.select(is_accepted))
             walkers.append(kept)
             lowest_loss = min(lowest_loss, *self.current.loss)
             factors = np.select(
@@ -243,7 +243,7 @@ def profile_posterior(
     """
     parameter_map = _ParameterMap(fitter.problem)
     parameter_indices = np.array([list(parameter_map.model.physical).index(name) for name in names])
-    start = fits.where(np.array([best_index]))
+    start = fits.select(np.array([best_index]))
     leap_fits, is_surprising = _fit_leaps(fitter, parameter_map, start, parameter_indices)
     which, side = np.repeat(parameter_indices, 2), np.tile([1.0, -1.0], len(parameter_indices))
     all_walks = np.arange(len(which))
@@ -252,7 +252,7 @@ def profile_posterior(
         parameter_map,
         which,
         side,
-        start.where(np.zeros_like(all_walks)),
+        start.select(np.zeros_like(all_walks)),
         np.full(len(which), _GAUSSIAN_CHECK_STDS),
     )
     if not is_surprising and _is_gaussian(walk, walk.fit_step(all_walks, (1.0,), _SCREENING_ITERATIONS)):
@@ -260,7 +260,7 @@ def profile_posterior(
     walked, walkers = walk.walk_outward(min(float(one.loss.min()) for one in (start, *leap_fits.values())))
     ridges = {}
     for number in parameter_indices.tolist():
-        parts = [start, walked.where(which[walkers] == number), *([leap_fits[number]] if number in leap_fits else [])]
+        parts = [start, walked.select(which[walkers] == number), *([leap_fits[number]] if number in leap_fits else [])]
         ridges[number] = _ParameterRidge.of(parameter_map, number, parameter_indices, LaplaceFits.concatenated(parts))
     longest = max(ridges.values(), key=lambda ridge: ridge.extent)
     long_ridges = [ridge for ridge in ridges.values() if ridge.extent > _MIN_RELATIVE_EXTENT * longest.extent]
@@ -274,7 +274,7 @@ def profile_posterior(
     alive = longest.weights > _NEGLIGIBLE_PROBABILITY
     weights = longest.weights[alive] / longest.weights[alive].sum()
     middle = int(np.searchsorted(np.cumsum(weights), 0.5))
-    return longest.fits.where(alive), weights, RidgePosterior(marginals, middle)
+    return longest.fits.select(alive), weights, RidgePosterior(marginals, middle)
 
 
 def _fit_leaps(
@@ -310,9 +310,9 @@ def _fit_leaps(
         hypotheses = [replace(start.hypotheses[0], noise_ratio=float(ratio)) for ratio in ratios]
         begins, pinned = np.repeat(points, n, axis=0), np.repeat(gradients, n, axis=0)
         fits = fitter.fit(hypotheses, begins, start.sensor_std[0], iterations, fixed_directions=pinned)
-        found = fits.where(np.arange(count) * n + _finite_losses(fits).reshape(count, n).argmin(axis=1))
+        found = fits.select(np.arange(count) * n + _finite_losses(fits).reshape(count, n).argmin(axis=1))
         kept = _finite_losses(found) < start.loss[0] + allowed
-        found = found.where(kept)
+        found = found.select(kept)
         points, gradients, leap_parameters, lengths = (
             points[kept],
             gradients[kept],
@@ -324,7 +324,7 @@ def _fit_leaps(
     promised = np.where(lengths > _SURPRISING_LEAP_STDS, 0.5 * lengths**2, 0.0)
     is_surprising = bool((found.loss - start.loss[0] < _SURPRISING_LOSS_FRACTION * promised).any())
     return {
-        number: found.where(leap_parameters == number) for number in np.unique(leap_parameters).tolist()
+        number: found.select(leap_parameters == number) for number in np.unique(leap_parameters).tolist()
     }, is_surprising
 
 
@@ -384,7 +384,7 @@ class _ParameterRidge:
         fits: LaplaceFits,
     ) -> _ParameterRidge:
         """That of a parameter, one of several."""
-        fits = fits.where(np.argsort(parameter_map.values(fits.mean)[:, parameter_index], kind="stable"))
+        fits = fits.select(np.argsort(parameter_map.values(fits.mean)[:, parameter_index], kind="stable"))
         values, slopes = parameter_map.values(fits.mean), parameter_map.slopes(fits.mean)
         cov = slopes @ fits.cov @ np.swapaxes(slopes, 1, 2)
         own_variance = cov[:, parameter_index, parameter_index]

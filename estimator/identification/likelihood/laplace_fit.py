@@ -103,11 +103,11 @@ class LaplaceFits:
     free_energy: FloatArray
     loss: FloatArray
 
-    def best(self, count: int) -> LaplaceFits:
+    def lowest_free_energy(self, count: int) -> LaplaceFits:
         """Those of the lowest free energies, the lowest first."""
-        return self.where(np.argsort(self.free_energy, kind="stable")[:count])
+        return self.select(np.argsort(self.free_energy, kind="stable")[:count])
 
-    def where(self, chosen: npt.NDArray[Any]) -> LaplaceFits:
+    def select(self, chosen: npt.NDArray[Any]) -> LaplaceFits:
         """Those of some hypotheses, told by their numbers or by flags."""
         kept = tuple(self.hypotheses[i] for i in np.arange(len(self.hypotheses))[chosen])
         parts = (self.mean, self.cov, self.sensor_std, self.free_energy, self.loss)

@@ -131,8 +131,8 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
     ends = [",displacement [m]", *(",0.001" for _ in lines[1:])]
     (tmp_path / "answer.csv").write_text("\n".join(line + end for line, end in zip(lines, ends, strict=True)))
     table = read_table(tmp_path / "answer.csv")
-    assert (table.step(), table.unit(table.u)) == (pytest.approx(RIG.step), "N")
-    np.testing.assert_allclose(table.columns[table.u], found.u, rtol=1e-9)
+    assert (table.step(), table.unit(table.input_column)) == (pytest.approx(RIG.step), "N")
+    np.testing.assert_allclose(table.columns[table.input_column], found.u, rtol=1e-9)
 
 
 @table(
@@ -180,7 +180,7 @@ def test_a_column_that_the_rig_names_has_its_unit(tmp_path):
     assert head == "time [s],Kraft [N]"
     path.write_text("\n".join([f"{head},displacement [m]", *(f"{row},0" for row in rows)]))
     table = read_table(path, "Kraft")
-    assert table.unit(table.u) == "N"
+    assert table.unit(table.input_column) == "N"
 
 
 def test_a_signal_that_never_changes_is_told(tmp_path, capsys):
