@@ -15,8 +15,19 @@ from benchmarks.rigs.bench_catalogue import PARAMETERS, Bench
 from benchmarks.rigs.dop853_simulator import FloatArray
 from benchmarks.rigs.simulated_records import SimulatedRecord, write_record, write_rig
 
-INTERVAL_PROBABILITY, POOLED_COVERAGE_BAR, CELL_COVERAGE_BAR = 0.9, (0.87, 0.93), (0.85, 0.95)
-MIN_ERROR_BAR, MAX_RATIO_TO_BOUND = 0.003, 1.2
+#: Probability of the intervals that are judged.
+INTERVAL_PROBABILITY = 0.9
+
+#: Bounds of the pooled coverage.
+POOLED_COVERAGE_BAR = (0.87, 0.93)
+
+#: Bounds that the confidence interval of each cell's coverage must reach.
+CELL_COVERAGE_BAR = (0.85, 0.95)
+#: Median relative error that always passes.
+MIN_ERROR_BAR = 0.003
+
+#: Median relative error over the Cramér-Rao deviation, at most.
+MAX_RATIO_TO_BOUND = 1.2
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,16 @@ from estimator.belief import Belief
 from estimator.rigs.rig import Channel, Rig
 from estimator.rigs.rig_prior import rig_prior
 
-POLICIES, PLAY_MODES = ("prbs", "efe"), ("samples", "blocks")
-N_SAMPLES, BLOCK_SAMPLES = 256, 64
+#: Policies that choose the inputs.
+POLICIES = ("prbs", "efe")
+
+#: Sample by sample through the environment, or in blocks as `duffing-env run` plays them.
+PLAY_MODES = ("samples", "blocks")
+#: Samples of a run.
+N_SAMPLES = 256
+
+#: Samples of a block.
+BLOCK_SAMPLES = 64
 
 #: Share of runs that may leave the range, of which the upper end of the 95 % interval must stay below.
 MAX_RANGE_EXIT_RATE = 0.05

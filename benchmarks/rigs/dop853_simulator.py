@@ -18,7 +18,11 @@ SENSOR_KINDS = ("displacement", "velocity", "acceleration")
 #: Directions of `state_sensitivities`: the state at the sample's begin, the held process noise, and the parameters, each relative.
 SENSITIVITY_DIRECTIONS = ("x", "v", "w", "m", "c", "a", "b")
 
-RTOL, ATOL = 1e-9, 1e-12
+#: Relative tolerance of a step.
+RTOL = 1e-9
+
+#: Absolute tolerance of a step, in sizes of x and x'.
+ATOL = 1e-12
 
 _A, _B, _E3, _E5 = (np.ascontiguousarray(getattr(DOP853, name)) for name in ("A", "B", "E3", "E5"))
 _C = np.ascontiguousarray(DOP853.C)

@@ -28,10 +28,21 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     "quintic stiffness": ("quintic",),
     "b not excited": ("not_identified",),
 }
-CLIPPING_FRACTION, INPUT_NOISE_FRACTION, QUINTIC_FRACTION = 0.7, 0.05, 0.2
+#: Level at which an output is clipped, as a fraction of its largest value.
+CLIPPING_FRACTION = 0.7
+
+#: Noise of the recorded input, as a fraction of the input.
+INPUT_NOISE_FRACTION = 0.05
+
+#: Quintic force at the peak, as a fraction of the cubic force there.
+QUINTIC_FRACTION = 0.2
 #: Of the amplitude: no record of a hundred can then tell b to better than 75 %, but m, c and a to 10 %, by the bound.
 WEAK_AMPLITUDE_FRACTION = 0.01
-MIN_DETECTION_RATE, MAX_FALSE_ALARM_RATE = 0.95, 0.05
+#: Share of the faults that are named, at least.
+MIN_DETECTION_RATE = 0.95
+
+#: Share of the good records that are flagged, at most.
+MAX_FALSE_ALARM_RATE = 0.05
 
 
 def make_faulty_record(fault: str, name: str, seed: int) -> tuple[SimulatedRecord, dict[str, Any]]:

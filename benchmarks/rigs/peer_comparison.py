@@ -26,7 +26,14 @@ from benchmarks.rigs.simulated_records import draw_guess, simulate_record, write
 OURS = "identify"
 #: Geometric mean of our error over theirs, at most; how much slower dynamax must be, at least; statements of ours.
 MAX_ERROR_RATIO = {"dynamax": 1.1, "dynamax-jit": 1.1, "scipy": 1.0, "pysindy": 1.0}
-TIMED_PEERS, MIN_TIME_RATIO, MAX_STATEMENTS = ("dynamax", "dynamax-jit"), 5.0, 5
+#: Peers whose times are compared.
+TIMED_PEERS = ("dynamax", "dynamax-jit")
+
+#: Their time over that of `identify`, at least.
+MIN_TIME_RATIO = 5.0
+
+#: Statements that a user of `identify` writes, at most.
+MAX_STATEMENTS = 5
 
 _STEPS_PER_PERIOD = 64  # of the peers' integration
 _N_SCRIPT_RUNS = 5  # of Python, for the time of a whole script

@@ -26,8 +26,11 @@ from estimator.rigs.rig import Channel, Rig
 SPRINGS = ("hardening", "softening", "wells")
 UNIT_OF_KIND = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 
-#: Samples of a record of a drawn rig, and of a settled sine.
-N_SAMPLES, N_SINE_SAMPLES = 4000, 4000
+#: Samples of a record of a random rig.
+N_SAMPLES = 4000
+
+#: Samples of a record of a settled sine.
+N_SINE_SAMPLES = 4000
 
 #: A result is right where each of m, c, a and b is within this many of its standard deviations.
 MAX_RIGHT_STDS = 4.0

@@ -17,9 +17,11 @@ from benchmarks.rigs.calibration import (
 )
 from benchmarks.rigs.simulated_records import draw_guess, simulate_record
 
-#: With a guess and without; and without one, from so many pieces of the record, of which all but the first begin in
-#: motion.
-SETTINGS, N_PIECES = ("guess", "no guess", "pieces"), 16
+#: With a guess, without one, and without one from pieces of the record, of which all but the first begin in motion.
+SETTINGS = ("guess", "no guess", "pieces")
+
+#: Pieces of a record.
+N_PIECES = 16
 
 
 def run_trial(task: tuple[str, tuple[str, ...], int]) -> list[TrialOutcome]:

@@ -23,12 +23,17 @@ SAMPLES_PER_PERIOD = (6, 12, 25, 50, 100, 200, 400, 800)
 #: Of rig a's limit.
 AMPLITUDE_FRACTIONS = (0.001, 0.01, 0.1, 0.5, 1.0)
 
-#: A parameter is out of reach where the bound exceeds the first of these, and within it below the second. Between them
-#: both words are right.
-MIN_OPEN_BOUND, MAX_IDENTIFIABLE_BOUND = 0.5, 0.1
+#: Relative Cramér-Rao deviation from which a parameter is out of reach.
+MIN_OPEN_BOUND = 0.5
+
+#: Relative Cramér-Rao deviation up to which a parameter is within reach; between the two either verdict is right.
+MAX_IDENTIFIABLE_BOUND = 0.1
 NOT_IDENTIFIED = "not_identified"
-#: Share of records that must be told so, and that may be told so wrongly.
-MIN_DETECTION_RATE, MAX_FALSE_ALARM_RATE = 0.95, 0.05
+#: Share of the records out of reach that are reported, at least.
+MIN_DETECTION_RATE = 0.95
+
+#: Share of the records within reach that are reported, at most.
+MAX_FALSE_ALARM_RATE = 0.05
 
 
 def bench_with_sampling(samples_per_period: int, amplitude: float) -> Bench:

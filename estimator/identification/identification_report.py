@@ -22,8 +22,11 @@ if TYPE_CHECKING:
 
     from estimator.identification.identification_result import Result
 
-#: Samples of a record that a figure shows at most, and outputs that start a free run.
-_MAX_SHOWN_SAMPLES, _FREE_RUN_OUTPUTS = 1500, 20
+#: Samples of a record in a figure, at most.
+_MAX_SHOWN_SAMPLES = 1500
+
+#: Outputs that start a free run.
+_FREE_RUN_OUTPUTS = 20
 
 _PARAMETER_MEANINGS = {
     "m": "mass",

@@ -18,14 +18,20 @@ from estimator.support.array_types import FloatArray
 #: Standard deviations of an interval's half width: the central 90 % of a Gaussian.
 STDS_PER_90_PERCENT = 1.6448536269514722
 
-#: Standard deviation of an offset, and of a noise of which nothing is known, in parts of the channel's scale.
-OFFSET_STD_FRACTION, NOISE_STD_FRACTION = 0.03, 0.001
+#: Standard deviation of an offset, as a fraction of the channel's scale.
+OFFSET_STD_FRACTION = 0.03
+
+#: Standard deviation of an unstated noise, as a fraction of the channel's scale.
+NOISE_STD_FRACTION = 0.001
 
 #: Of a displacement at the start, in parts of the output's scale.
 _INITIAL_DISPLACEMENT_FRACTION = 0.3
 
-#: Points of the quadrature along each parameter, and along each offset.
-_PARAMETER_NODES, _OFFSET_NODES = 7, 3
+#: Quadrature points along each parameter.
+_PARAMETER_NODES = 7
+
+#: Quadrature points along each offset.
+_OFFSET_NODES = 3
 
 
 def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:

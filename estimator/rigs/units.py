@@ -21,11 +21,13 @@ UnitPowers = tuple[int, int, int]
 #: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
 MAGNITUDE_BOUNDS = 1e-30, 1e30
 
-#: Units of SI, which prefixes scale; and others, with what each is in SI.
-_SI_UNITS, _SI_PREFIXES = (
-    "N|V|A|Pa|m",
-    {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "": 1.0, "k": 1e3, "M": 1e6},
-)
+#: SI units that take prefixes, as a regular expression.
+_SI_UNITS = "N|V|A|Pa|m"
+
+#: SI prefix to factor.
+_SI_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "": 1.0, "k": 1e3, "M": 1e6}
+
+#: Units outside the SI to their factor and SI unit.
 _OTHER_UNITS = {"in": (0.0254, "m"), "ft": (0.3048, "m"), "deg": (math.pi / 180, "rad"), "°": (math.pi / 180, "rad")}
 _UNITS_WITHOUT_PREFIX = {"g": (9.80665, "m/s²"), "lb": (4.4482216152605, "N"), "lbf": (4.4482216152605, "N")}
 _UNITS_WITHOUT_PREFIX |= {"mps": (1.0, "m/s"), "mps2": (1.0, "m/s²")}

@@ -11,8 +11,11 @@ import numpy.typing as npt
 
 from estimator.support.array_types import FloatArray
 
-#: Options that are sizes lie between these: squares and products of some of them neither overflow nor vanish.
-MIN_MAGNITUDE, MAX_MAGNITUDE = 1e-12, 1e12
+#: Smallest size that an option may have: squares and products of two sizes do not underflow.
+MIN_MAGNITUDE = 1e-12
+
+#: Largest size that an option may have: squares and products of two sizes do not overflow.
+MAX_MAGNITUDE = 1e12
 
 #: The largest seed.
 MAX_SEED = 2**128

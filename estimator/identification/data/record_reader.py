@@ -29,11 +29,17 @@ _MAX_FILE_BYTES = 2**30
 #: A file of that size is read in less [s]; a damaged one might be read for ever.
 _MAT_TIMEOUT = 300.0
 
-#: A level of the output is a stop where the signal comes to it this often, and so many times as often as to the next.
-_MIN_CLIPPING_VISITS, _MIN_CLIPPING_RATIO = 3, 4
+#: An end of the range counts as a stop after this many visits of the output.
+_MIN_CLIPPING_VISITS = 3
 
-#: Fewer outputs identify nothing, and a piece of fewer tells next to nothing.
-_MIN_OUTPUTS, _MIN_PIECE_OUTPUTS = 50, 8
+#: Samples at a stop, per sample at the next level, at least.
+_MIN_CLIPPING_RATIO = 4
+
+#: Outputs in all records, at least: fewer identify nothing.
+_MIN_OUTPUTS = 50
+
+#: Outputs in a piece of a record, at least.
+_MIN_PIECE_OUTPUTS = 8
 
 
 #: Reads a MAT file in a process of its own: SciPy's reader is ended by a segmentation fault at some damaged ones.

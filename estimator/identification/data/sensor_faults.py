@@ -9,14 +9,20 @@ import numpy.typing as npt
 
 from estimator.support.array_types import FloatArray
 
-#: A burst stands still for this many samples or more, and ends with a jump of so many times the usual change.
-_MIN_STALE_SAMPLES, _MIN_JUMP_FACTOR = 4, 4.0
+#: Samples for which the output stands still in a burst, at least.
+_MIN_STALE_SAMPLES = 4
+
+#: The jump that ends a burst, in usual changes of the output, at least.
+_MIN_JUMP_FACTOR = 4.0
 
 #: Bursts that are no chance.
 _MIN_BURSTS = 3
 
-#: Part of the changes of a signal whose values are repeated that come at every n-th sample; and the longest such n.
-_MIN_REGULAR_FRACTION, _MAX_REPEATS = 0.98, 64
+#: Fraction of all changes that lie on every n-th sample, where a sensor repeats each value n times.
+_MIN_REGULAR_FRACTION = 0.98
+
+#: Largest such n [samples].
+_MAX_REPEATS = 64
 
 
 class StaleOutputs(NamedTuple):

@@ -36,8 +36,11 @@ from estimator.support.array_types import FloatArray
 #: Times may be off an even grid by this part of a step, or by their last digit, and are even all the same.
 _EVENNESS_TOLERANCE = 0.005
 
-#: Where most steps are alike to this part of them, a leap of whole steps is of lines that were lost.
-REGULAR_STEP_TOLERANCE, MIN_REGULAR_FRACTION = 0.05, 0.8
+#: Steps of a table count as alike within this fraction of the usual step.
+REGULAR_STEP_TOLERANCE = 0.05
+
+#: Fraction of steps that are alike, from which a jump of whole steps means lost lines.
+MIN_REGULAR_FRACTION = 0.8
 
 #: A step is no longer than this many usual ones; what is longer is a gap.
 _MAX_STEP_FACTOR = 3.0

@@ -25,9 +25,11 @@ _MAX_STDS_FROM_GUESS = 5.0
 #: A guess leads astray where it moves a parameter by more than this part of it.
 _MAX_RELATIVE_SHIFT = 0.01
 
-#: A wrong step or scale is looked for that is nearer to a factor of 2, either way, than to 1, where the guess of the
-#: parameters that it changes has less than 1 % of a chance: chi square is larger, of so many of them.
-_MIN_LOG_FACTOR, _CHI_SQUARE_1_PERCENT = 0.5 * np.log(2), {2: 9.21, 3: 11.34, 4: 13.28}
+#: |log factor| from which a wrong step or scale is reported: nearer to a factor of 2, either way, than to 1.
+_MIN_LOG_FACTOR = 0.5 * np.log(2)
+
+#: Number of parameters to the 99 % quantile of chi square.
+_CHI_SQUARE_1_PERCENT = {2: 9.21, 3: 11.34, 4: 13.28}
 
 
 @dataclass(frozen=True)

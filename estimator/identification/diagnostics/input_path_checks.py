@@ -20,16 +20,22 @@ MIN_EVIDENCE = 7.0
 #: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
 _NOISE_RATIO_FACTORS = (1.0, 0.1, 0.01)
 
-#: Samples by which the input may be earlier or later than is thought, and many by which it may be later: these are
-#: coarse, and lead to the right one when records are identified again.
-_SMALL_DELAY_SHIFTS, _LARGE_DELAY_SHIFTS = (
-    range(-MAX_UNSTATED_DELAY, MAX_UNSTATED_DELAY + 1),
-    (5, 8, 12, 16, 20, 25, 30, 40),
-)
+#: Delays that are tried, relative to the rig's [samples].
+_SMALL_DELAY_SHIFTS = range(-MAX_UNSTATED_DELAY, MAX_UNSTATED_DELAY + 1)
 
-#: Parts of a sample, and time constants of a lag in samples, that are tried first, and about what is best.
-_FIRST_DELAY_FRACTIONS, _FIRST_LAGS = (-0.5, 0.5), (0.5, 2.0)
-_REFINED_DELAY_FRACTIONS, _REFINED_LAGS = (-0.5, -0.25, 0.25, 0.5), (0.25, 0.5, 1.0, 2.0, 4.0)
+#: Large delays [samples], coarse: the finding leads to the right one when records are identified again.
+_LARGE_DELAY_SHIFTS = (5, 8, 12, 16, 20, 25, 30, 40)
+
+#: Fractional delays that are tried first [samples].
+_FIRST_DELAY_FRACTIONS = (-0.5, 0.5)
+
+#: Time constants of a lag that are tried first [samples].
+_FIRST_LAGS = (0.5, 2.0)
+#: Fractional delays about the best hypothesis [samples].
+_REFINED_DELAY_FRACTIONS = (-0.5, -0.25, 0.25, 0.5)
+
+#: Time constants of a lag about the best hypothesis [samples].
+_REFINED_LAGS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 #: Digits of a delay and of a lag in samples that are told.
 _REPORTED_DIGITS = 2
@@ -40,9 +46,11 @@ _MAX_ROUGHNESS = 0.7
 #: Steps of a fit of another hypothesis, at most.
 _MAX_FIT_STEPS = 12
 
-#: Samples of a record on which other hypotheses about the input are tried first, and the nats by which one that is
-#: given up is worse there.
-_SCREENING_SAMPLES, _SCREENING_LOSS = 1024, 10.0
+#: Samples of each record on which hypotheses about the input are screened.
+_SCREENING_SAMPLES = 1024
+
+#: Free energy by which a hypothesis that is dropped there is worse than the rig's [nats].
+_SCREENING_LOSS = 10.0
 
 
 def check_input_path(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:

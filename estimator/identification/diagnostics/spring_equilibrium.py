@@ -8,9 +8,14 @@ import numpy as np
 
 from estimator.belief import Belief
 
-#: Standard deviations by which the stiffness at rest differs from a for sure; and by what part of it, or by how many
-#: standard deviations of a itself, that matters.
-_MIN_STDS_OF_DIFFERENCE, _MIN_RELATIVE_DIFFERENCE, _MIN_STDS_OF_STIFFNESS = 5.0, 1e-3, 3.0
+#: Standard deviations by which the stiffness at rest differs from a in an asymmetric spring.
+_MIN_STDS_OF_DIFFERENCE = 5.0
+
+#: Smallest difference that matters, as a fraction of a.
+_MIN_RELATIVE_DIFFERENCE = 1e-3
+
+#: Smallest difference that matters, in standard deviations of a.
+_MIN_STDS_OF_STIFFNESS = 3.0
 
 
 class SpringEquilibrium(NamedTuple):

@@ -8,14 +8,20 @@ from estimator.identification.fitting.weak_form import delay_misfits
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.rigs.rig import MAX_DELAY
 
-#: Delays are tried up to this part of a record, and early answers up to this many samples.
-_MAX_DELAY_FRACTION, _MAX_ADVANCE = 0.25, 60
+#: Longest delay that is tried, as a fraction of the shortest record.
+_MAX_DELAY_FRACTION = 0.25
+
+#: Samples by which the output may precede the input.
+_MAX_ADVANCE = 60
 
 #: Steps between the delays that are tried first, in parts of a period, and about the best of them.
 _COARSE_PERIOD_FRACTION = 1 / 16
 
-#: Part of the misfit at the rig's own delay that another must leave, at most, and part of that beside it.
-_MAX_MISFIT_TO_STATED, _MAX_MISFIT_TO_MEDIAN = 0.5, 0.9
+#: Misfit at another delay, as a fraction of the misfit at the rig's delay, at most.
+_MAX_MISFIT_TO_STATED = 0.5
+
+#: Misfit at another delay, as a fraction of the median over all delays, at most.
+_MAX_MISFIT_TO_MEDIAN = 0.9
 
 
 def find_trigger_offset(problem: IdentificationProblem) -> int | None:

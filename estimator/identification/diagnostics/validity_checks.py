@@ -36,20 +36,30 @@ from estimator.support.array_types import FloatArray
 #: Probability of a false alarm of a test of the residuals.
 _FALSE_ALARM_PROBABILITY = 1e-4
 
-#: Largest disturbance of the force in parts of the input, in parts of its limit, which is there however weak an input
-#: is, and in parts of what the rig says of it.
-_MAX_DISTURBANCE_TO_INPUT, _MAX_DISTURBANCE_TO_LIMIT, _MAX_DISTURBANCE_TO_STATED = 0.02, 0.005, 3.0
+#: Largest disturbance of the force that passes, as a fraction of the input's root mean square.
+_MAX_DISTURBANCE_TO_INPUT = 0.02
+
+#: The same as a fraction of the input's limit, for weak inputs.
+_MAX_DISTURBANCE_TO_LIMIT = 0.005
+
+#: The same in multiples of the disturbance that the rig states.
+_MAX_DISTURBANCE_TO_STATED = 3.0
 
 #: Standard deviations by which the disturbance is larger than that for sure: with a probability of 95 %, about.
 _STDS_FOR_95_PERCENT = 1.645
 
-#: Largest relative standard deviation of a parameter that is called identified. Where the posterior is no Gaussian, the
-#: largest width of its central 68 % in parts of the outer end: a factor of five between the ends.
-_MAX_RELATIVE_STD, _MAX_RELATIVE_WIDTH = 1 / 3, 0.8
+#: Largest relative standard deviation of an identified parameter.
+_MAX_RELATIVE_STD = 1 / 3
 
-#: The same after one settled sine, along whose ridge a walk ends where it may go on beyond a gap; and by how much the
-#: inputs may differ from a sine, in parts of themselves.
-_MAX_RELATIVE_WIDTH_OF_SINE, _SINE_TOLERANCE = 0.02, 0.01
+#: Where the posterior is no Gaussian, largest width of the central 68 % interval, as a fraction of its outer end: a
+#: factor of five between the ends.
+_MAX_RELATIVE_WIDTH = 0.8
+
+#: The same after one settled sine, along whose ridge a walk may end at a gap.
+_MAX_RELATIVE_WIDTH_OF_SINE = 0.02
+
+#: Largest deviation of an input from a sine, relative to the input.
+_SINE_TOLERANCE = 0.01
 
 #: Largest cubic force, in parts of the linear one, of a spring that is called linear.
 _MAX_LINEAR_CUBIC_FRACTION = 0.05
@@ -64,15 +74,29 @@ _MIN_JUDGED_ERROR = 1e-6
 #: Corners of a high-pass in the output's channel that are tried, in parts of the mean frequency.
 _HIGH_PASS_CORNERS = (0.002, 0.005, 0.01, 0.02, 0.05)
 
-#: How far off a gross outlier is: in parts of what 99 % of all are off, and of those beside it.
-_OUTLIER_TO_QUANTILE, _OUTLIER_TO_NEIGHBOURS = 10.0, 5.0
+#: Smallest deviation of a gross outlier, in 99 % quantiles of the deviations.
+_OUTLIER_TO_QUANTILE = 10.0
 
-#: An input rests within so much of its largest. Blows are inputs that act for less than so much of the time; so few
-#: samples see them badly, and so many well.
-_RESTING_INPUT_FRACTION, _MAX_IMPACT_DUTY, _MAX_IMPACT_SAMPLES, _SUFFICIENT_IMPACT_SAMPLES = 0.02, 0.1, 5, 10
+#: The same in deviations of its two neighbours.
+_OUTLIER_TO_NEIGHBOURS = 5.0
 
-#: Fewest samples in a period that pass without a word, and as many as are asked for where there are fewer.
-MIN_SAMPLES_PER_PERIOD, RECOMMENDED_SAMPLES_PER_PERIOD = 5.0, 6
+#: An input is at rest below this fraction of its largest value.
+_RESTING_INPUT_FRACTION = 0.02
+
+#: Impacts act during less than this fraction of the samples.
+_MAX_IMPACT_DUTY = 0.1
+
+#: Samples in an impact up to which its impulse is uncertain.
+_MAX_IMPACT_SAMPLES = 5
+
+#: Samples in an impact that the message recommends.
+_SUFFICIENT_IMPACT_SAMPLES = 10
+
+#: Samples in a period below which the sampling is too slow.
+MIN_SAMPLES_PER_PERIOD = 5.0
+
+#: Samples in a period that the message recommends.
+RECOMMENDED_SAMPLES_PER_PERIOD = 6
 
 _TERM_DESCRIPTIONS = {
     "cubic_damping": "a damping that grows with the cube of the velocity",

@@ -35,8 +35,14 @@ _WIDE_PRIOR_FACTOR = 30.0
 #: output as much as it disturbs it. It is open to either side.
 _INITIAL_NOISE_RATIOS = np.geomspace(1e-2, 1e2, 5)
 
-#: The first look takes so many periods of a record, and at least and at most so many samples.
-_FIRST_PERIODS, _MIN_FIRST_SAMPLES, _MAX_FIRST_SAMPLES = 25, 1024, 4096
+#: Periods of each record in the first fits.
+_FIRST_PERIODS = 25
+
+#: Fewest samples of each record in the first fits.
+_MIN_FIRST_SAMPLES = 1024
+
+#: Most samples of each record in the first fits.
+_MAX_FIRST_SAMPLES = 4096
 
 #: The equation is tested with so many periods, where these are more samples.
 _WEAK_FORM_PERIODS = 40
@@ -44,19 +50,29 @@ _WEAK_FORM_PERIODS = 40
 #: Steps of it, after which so many of its hypotheses are kept.
 _FIRST_SEARCH_STAGES = ((3, 8), (10, 1))
 
-#: Where the disturbance is more than so much of the input, so many times so many starts are drawn. They are fitted to
-#: pieces of so many periods, and of so many samples at least, which grow by a factor until they are all.
-_MAX_GOOD_DISTURBANCE, _MAX_RESTARTS, _N_RANDOM_STARTS, _SEGMENT_PERIODS, _MIN_SEGMENT_SAMPLES, _SEGMENT_GROWTH = (
-    0.05,
-    3,
-    192,
-    4,
-    128,
-    4,
-)
+#: Disturbance of a good result, as a fraction of the input, at most; above it other starts are drawn.
+_MAX_GOOD_DISTURBANCE = 0.05
 
-#: Steps of each of these fits; how many results are kept of what was drawn, of pieces, and of all records.
-_RESTART_FIT_STEPS, _N_KEPT_STARTS = 8, (48, 12, 3)
+#: Rounds of random starts, at most.
+_MAX_RESTARTS = 3
+
+#: Random starts in a round.
+_N_RANDOM_STARTS = 192
+
+#: Periods in the first segments that random starts are fitted to.
+_SEGMENT_PERIODS = 4
+
+#: Samples in the first segments, at least.
+_MIN_SEGMENT_SAMPLES = 128
+
+#: Factor by which segments grow from round to round.
+_SEGMENT_GROWTH = 4
+
+#: Steps of a fit from a random start.
+_RESTART_FIT_STEPS = 8
+
+#: Results that are kept of random starts, of segments, and of all records.
+_N_KEPT_STARTS = (48, 12, 3)
 
 #: Nats by which the free energies of results that are the same differ at most.
 _SAME_OPTIMUM_NATS = 5.0
@@ -64,25 +80,42 @@ _SAME_OPTIMUM_NATS = 5.0
 #: Steps of a fit to all records, from what the first look found and from where it began, of which the best is kept.
 _CONFIRMING_FIT_STEPS = 3
 
-#: Ratios of a grid, how many standard deviations it is to reach either way in the end, and by how many nats its ends
-#: must be worse than its best.
-_RATIO_GRID_POINTS, _GRID_REACH_STDS, _MIN_EDGE_NATS = 8, 3.0, 2.0
+#: Ratios in a grid.
+_RATIO_GRID_POINTS = 8
 
-#: Ratios that are looked at lie within these bounds, in the same parts.
-_MIN_NOISE_RATIO, _MAX_NOISE_RATIO = 1e-5, 1e4
+#: Standard deviations of the log ratio that the last grid reaches, either way.
+_GRID_REACH_STDS = 3.0
 
-#: Steps of integration a sample, of which the fewest are taken whose error is small, in standard deviations. It is of
-#: order 4, so that the most are enough for motions of a third of a period a sample. Before a fit
-#: it is known only that a step should turn the motion by no more than an angle.
-_SUBSTEP_CHOICES, _MAX_INTEGRATION_ERROR, _MAX_SUBSTEP_ANGLE = (2, 4, 8, 16, 32), 0.02, 0.25
+#: Free energy by which the ends of a grid are worse than its best, at least [nats].
+_MIN_EDGE_NATS = 2.0
 
-#: Fits at most, each with the steps of integration and the motions that the one before asks for; and the change of the
-#: free energy by other motions that asks for one more [nats].
-_MAX_SETTLING_ROUNDS, _MIN_STATE_CHANGE_NATS = 6, 0.1
+#: Smallest ratio, in units of the squared angular frequency.
+_MIN_NOISE_RATIO = 1e-5
 
-#: Noises of a record are other than was thought where they differ by so much in the logarithm, and so many standard
-#: deviations.
-_MIN_LOG_NOISE_CHANGE, _MIN_NOISE_CHANGE_STDS = 0.05, 6.0
+#: Largest ratio, in the same units.
+_MAX_NOISE_RATIO = 1e4
+
+#: Runge-Kutta steps per sample; the fewest with a small error are taken. The method has order 4, and the most are enough
+#: for motions of a third of a period per sample.
+_SUBSTEP_CHOICES = (2, 4, 8, 16, 32)
+
+#: Largest error of the integration, in standard deviations of stiffness and damping.
+_MAX_INTEGRATION_ERROR = 0.02
+
+#: Largest phase of the motion per step, before any fit [rad].
+_MAX_SUBSTEP_ANGLE = 0.25
+
+#: Fits with new substeps, initial states and noises of the records, at most.
+_MAX_SETTLING_ROUNDS = 6
+
+#: Change of the free energy by new initial states that asks for one more fit [nats].
+_MIN_STATE_CHANGE_NATS = 0.1
+
+#: Change of the log noise of a record that asks for one more fit.
+_MIN_LOG_NOISE_CHANGE = 0.05
+
+#: The same change in standard deviations.
+_MIN_NOISE_CHANGE_STDS = 6.0
 
 
 @dataclass(frozen=True, eq=False)

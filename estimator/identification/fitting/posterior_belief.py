@@ -26,8 +26,14 @@ _REFIT_SUBSTEPS = 16
 #: Factor of the ratio of the noises, either way, within which a search from a belief begins.
 _REFIT_RATIO_REACH = 3.0
 
-#: For its history the records are halved so often, and shorter ones are left out; and steps of a fit at most.
-_MAX_HALVINGS, _MIN_HISTORY_SAMPLES, _MAX_HISTORY_FIT_STEPS = 7, 50, 12
+#: Times that the records are halved for the history, at most.
+_MAX_HALVINGS = 7
+
+#: Samples of the longest record in a fit of the history, at least.
+_MIN_HISTORY_SAMPLES = 50
+
+#: Steps of a fit of the history, at most.
+_MAX_HISTORY_FIT_STEPS = 12
 
 #: Outputs that were used, with the mean and standard deviation of each parameter that they leave.
 ContractionHistory = tuple[tuple[int, dict[str, tuple[float, float]]], ...]

@@ -22,27 +22,56 @@ from estimator.identification.likelihood.laplace_fit import LaplaceFits, Laplace
 from estimator.rigs.physical_parameters import physical_jacobian, to_physical
 from estimator.support.array_types import FloatArray
 
-#: Standard deviations at which a Gaussian is checked, and within which factor of them the root of what the records lose
-#: may be.
-_GAUSSIAN_CHECK_STDS, _GAUSSIAN_CHECK_FACTOR = 2.0, 1.25
+#: Standard deviations from the mode at which the posterior is compared with a Gaussian.
+_GAUSSIAN_CHECK_STDS = 2.0
 
-#: What the records lose at the ends of a walk [nats], steps to there at most, and factors of a parameter, either
-#: way, beyond which it does not matter what it is.
-_MAX_LOSS, _MAX_WALK_STEPS, _MAX_PARAMETER_FACTOR = 8.0, 30, 100.0
+#: Factor between the root of the loss there and the Gaussian's, either way, at most.
+_GAUSSIAN_CHECK_FACTOR = 1.25
 
-#: A step is longer after one that cost less, shorter after one that cost more, and taken again where it cost most; all
-#: in nats.
-_LOW_STEP_LOSS, _HIGH_STEP_LOSS, _MAX_STEP_LOSS, _STEP_GROWTH, _STEP_SHRINKAGE = 0.5, 1.5, 3.0, 1.7, 0.4
+#: Loss at which a walk ends [nats].
+_MAX_LOSS = 8.0
+
+#: Steps of a walk, at most.
+_MAX_WALK_STEPS = 30
+
+#: Factor of the parameter, either way, at which a walk ends.
+_MAX_PARAMETER_FACTOR = 100.0
+
+#: Loss below which the next step is longer [nats].
+_LOW_STEP_LOSS = 0.5
+
+#: Loss above which the next step is shorter [nats].
+_HIGH_STEP_LOSS = 1.5
+
+#: Loss above which a step is rejected and repeated [nats].
+_MAX_STEP_LOSS = 3.0
+
+#: Factor of a longer step.
+_STEP_GROWTH = 1.7
+
+#: Factor of a repeated step.
+_STEP_SHRINKAGE = 0.4
 
 #: Ratios of the noises that are tried beside that of the step before, as factors.
 _WALK_RATIO_FACTORS = (0.2, 1.0, 5.0)
 
-#: Leaps either way: some of so many standard deviations, and others in the parameter's logarithm, each so far; a length
-#: in standard deviations beyond which there is none.
-_LEAP_STDS, _N_LOG_LEAPS, _LOG_LEAP_LENGTH, _MAX_LEAP_STDS = (6.0, 15.0), 5, 0.5 * np.log(10.0), 1e9
+#: Lengths of the short leaps [standard deviations].
+_LEAP_STDS = (6.0, 15.0)
 
-#: Factors of the ratio of the noises that are tried there, and what the records may lose after a few steps [nats].
-_LEAP_RATIO_FACTORS, _MAX_SCREENING_LOSS = (1.0, 0.1, 0.01), 1000.0
+#: Number of leaps in the parameter's logarithm, either way.
+_N_LOG_LEAPS = 5
+
+#: Length of each in the logarithm.
+_LOG_LEAP_LENGTH = 0.5 * np.log(10.0)
+
+#: Longest leap [standard deviations].
+_MAX_LEAP_STDS = 1e9
+
+#: Factors of the noise ratio that are tried after a leap.
+_LEAP_RATIO_FACTORS = (1.0, 0.1, 0.01)
+
+#: Loss after the first steps above which a leap is dropped [nats].
+_MAX_SCREENING_LOSS = 1000.0
 
 #: A ridge of so much of the longest one's extent counts for all parameters.
 _MIN_RELATIVE_EXTENT = 0.3
@@ -51,18 +80,29 @@ _MIN_RELATIVE_EXTENT = 0.3
 #: coefficient, of which there are six or so.
 _NOISE_LOSS_ALLOWANCE = 2.5
 
-#: A relative standard deviation below which no other place is looked for, and a probability that is neglected.
-_MIN_RELATIVE_STD, _NEGLIGIBLE_PROBABILITY = 1e-3, 1e-6
+#: Relative standard deviation below which a parameter has no leaps.
+_MIN_RELATIVE_STD = 1e-3
 
-#: A leap speaks against a Gaussian from so many standard deviations on, where it costs less than this part of the
-#: parabola.
-_SURPRISING_LEAP_STDS, _SURPRISING_LOSS_FRACTION = 4.0, 0.5
+#: Probability of a place of a ridge that is left out.
+_NEGLIGIBLE_PROBABILITY = 1e-6
 
-#: Steps of a fit at most; of the check and the first look of a leap, and of all else.
-_SCREENING_ITERATIONS, _FIT_ITERATIONS = 3, 10
+#: Length from which a leap speaks against a Gaussian [standard deviations].
+_SURPRISING_LEAP_STDS = 4.0
 
-#: Times that a step is halved, and the length in standard deviations below which a walk is over.
-_MAX_HALVINGS, _MIN_STEP_STDS = 12, 0.02
+#: Its loss as a fraction of the Gaussian's, at most.
+_SURPRISING_LOSS_FRACTION = 0.5
+
+#: Steps of a fit in the Gaussian check and in the screening of leaps.
+_SCREENING_ITERATIONS = 3
+
+#: Steps of every other fit along a ridge.
+_FIT_ITERATIONS = 10
+
+#: Times that a step is halved where the parameter jumps, at most.
+_MAX_HALVINGS = 12
+
+#: Length of a step below which a walk ends [standard deviations].
+_MIN_STEP_STDS = 0.02
 
 #: Probability of a standard deviation either way.
 ONE_STD_PROBABILITY = 0.6826894921370859

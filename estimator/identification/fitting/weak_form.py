@@ -34,12 +34,18 @@ _MAX_BRIDGED_PERIODS = 1 / 6
 #: Periods over which an integrated signal loses its drift.
 _HIGH_PASS_PERIODS = (3.0, 10.0, 30.0)
 
-#: A record that begins with so many samples of inputs and outputs below so much of its largest begins at rest.
-_MIN_RESTING_SAMPLES, _RESTING_FRACTION = 8, 0.05
+#: Resting samples at the start of a record that begins at rest, at least.
+_MIN_RESTING_SAMPLES = 8
 
-#: Coefficients that are drawn lie between so much and so many of their natural sizes: these are those of a motion that
-#: is a sine, of the mean frequency. One that goes from well to well is slower, and has harmonics.
-_MIN_RANDOM_SIZE, _MAX_RANDOM_SIZE = 0.003, 2.0
+#: Inputs and outputs are at rest below this fraction of their size.
+_RESTING_FRACTION = 0.05
+
+#: Smallest random coefficient, in natural sizes: those of a sine of the mean frequency. A motion between two wells is
+#: slower and has harmonics.
+_MIN_RANDOM_SIZE = 0.003
+
+#: Largest random coefficient, in natural sizes.
+_MAX_RANDOM_SIZE = 2.0
 
 #: Coefficients that are drawn; the others begin at 0.
 _RANDOM_COEFFICIENTS = ("gain", "damping", "stiffness", "cubic")

@@ -35,9 +35,11 @@ _CREEP_SPEED_FRACTION = 0.05
 #: Samples of a gap that is bridged before it is known how long a period is.
 _MAX_BRIDGED_GAP = 16
 
-#: Inputs of a piece are few where they have less than so much of the power of the strongest, and all of them where they
-#: have more than so much.
-_WEAK_INPUT_POWER, _STRONG_INPUT_POWER = 0.25, 0.98
+#: Power of a weakly driven segment, as a fraction of the strongest, at most.
+_WEAK_INPUT_POWER = 0.25
+
+#: Power of a segment that holds the strongest inputs, as a fraction of the strongest, at least.
+_STRONG_INPUT_POWER = 0.98
 
 
 class FilterSamples(NamedTuple):

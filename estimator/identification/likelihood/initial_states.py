@@ -18,22 +18,33 @@ from estimator.identification.likelihood.laplace_fit import FitHypothesis
 from estimator.inference.fisher_information import filter_records
 from estimator.support.array_types import FloatArray
 
-#: A grid of so many displacements and velocities each, up to so much of the largest, is looked at first. What is judged
-#: is the first period of a record, of so many samples at least and at most.
-_GRID_POINTS, _GRID_EXTENT, _JUDGED_SAMPLES_BOUNDS = 11, 1.5, (16, 256)
+#: Displacements, and velocities, in the grid of initial states.
+_GRID_POINTS = 11
+
+#: Extent of the grid, in largest displacements and velocities.
+_GRID_EXTENT = 1.5
+
+#: Bounds of the samples on which the grid is judged; between them it is one period.
+_JUDGED_SAMPLES_BOUNDS = (16, 256)
 
 #: Series that are judged at once, about.
 _MAX_SERIES_PER_BATCH = 2048
 
-#: With noises of at least so much of the output a filter comes to the motion from the nearest place of the grid, though
-#: the oscillator is not linear. Newton's method takes so many steps with them, and so many with the noises as they are.
-_COARSE_SENSOR_FRACTION, _NEWTON_STEPS = 0.3, (4, 6)
+#: Sensor noise of the first Newton steps, as a fraction of the output, at least: with it the filter converges from the
+#: nearest point of the grid although the oscillator is nonlinear.
+_COARSE_SENSOR_FRACTION = 0.3
+
+#: Newton steps with that noise, and with the noise of the hypothesis.
+_NEWTON_STEPS = (4, 6)
 
 #: Nats by which another motion must be better. A few do not tell: the filter is not linear about the same place.
 _MIN_GAIN = 10.0
 
-#: Distance of finite differences, and the longest step, in parts of the largest.
-_FINITE_DIFFERENCE_STEP, _MAX_NEWTON_STEP = 1e-3, 0.3
+#: Step of the finite differences, in largest states.
+_FINITE_DIFFERENCE_STEP = 1e-3
+
+#: Longest Newton step, in largest states.
+_MAX_NEWTON_STEP = 0.3
 
 #: Parts of Newton's step that are tried.
 _LINE_SEARCH_FRACTIONS = np.array([1.0, 0.3, 0.1, 0.01])

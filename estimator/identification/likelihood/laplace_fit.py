@@ -24,9 +24,20 @@ from estimator.identification.likelihood.identification_problem import FilterSam
 from estimator.inference.fisher_information import FilteredRecords, filter_records
 from estimator.support.array_types import FloatArray
 
-#: Damping at the start of a fit, its change after a step that fails or succeeds, its least, and where a fit is given
-#: up.
-_INITIAL_DAMPING, _DAMPING_INCREASE, _DAMPING_DECREASE, _MIN_DAMPING, _MAX_DAMPING = 1e-6, 30.0, 0.1, 1e-9, 1e2
+#: Levenberg-Marquardt damping at the start of a fit.
+_INITIAL_DAMPING = 1e-6
+
+#: Factor of the damping after a step that fails.
+_DAMPING_INCREASE = 30.0
+
+#: Factor of the damping after a step that succeeds.
+_DAMPING_DECREASE = 0.1
+
+#: Smallest damping.
+_MIN_DAMPING = 1e-9
+
+#: Damping above which a fit ends.
+_MAX_DAMPING = 1e2
 
 #: A step that promises to lower the loss by less is the last of a fit [nats]: it is a seventh of a standard deviation,
 #: of which it leaves a small part.
