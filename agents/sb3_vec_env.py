@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from duffing_env.env_base import ReadOnlyOption, check_reset_options
 from duffing_env.vector_env import DuffingVectorEnv
-from estimator.support.array_types import Parameters
+from estimator.models.named_parameters import Parameters
 from estimator.support.optional_dependencies import require_packages
 
 require_packages("stable_baselines3")

@@ -26,7 +26,8 @@ from duffing_env.storage.kernel_spec import (
 from duffing_env.storage.random_streams import new_stream_words
 from estimator.belief import Belief, record_size
 from estimator.compilation.simd import LANES
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.models.named_parameters import Parameters
+from estimator.support.array_types import FloatArray
 
 _OUTCOME_NAMES = tuple(name.lower() for name in OUTCOME_ROWS)
 

@@ -24,8 +24,8 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
 from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
+from estimator.models.named_parameters import Parameters
 from estimator.support.argument_checks import check_choice, short_repr, to_float_array
-from estimator.support.array_types import Parameters
 
 if TYPE_CHECKING:
     from duffing_env.rendering.episode_renderer import EpisodeRenderer

@@ -23,6 +23,7 @@ from estimator.inference.noise_grid import NoiseGridSize, initial_weights, membe
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.priors import log_uniform_moments, weak_prior
+from estimator.rigs.silverbox_constants import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.rigs.units import Scales
 from estimator.settings import checked_noise_hypotheses
 from estimator.support.argument_checks import (
@@ -34,7 +35,7 @@ from estimator.support.argument_checks import (
     check_number,
     short_repr,
 )
-from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.support.array_types import FloatArray
 
 #: More ratios of the noises, or values of each, than are worth their time.
 MAX_HYPOTHESES = 99

@@ -32,8 +32,9 @@ from duffing_env.storage.kernel_spec import OUTCOME_ROWS
 from duffing_env.tracks.continuous_tracks import ContinuousEnv
 from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from estimator.belief import Belief
+from estimator.models.named_parameters import Parameters
 from estimator.support.argument_checks import MAX_SEED, check_integer, short_repr, to_float_array
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 
 _RESET_MODES = {
     AutoresetMode.DISABLED: RESET_MANUALLY,

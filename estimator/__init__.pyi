@@ -8,12 +8,14 @@ from .inference.pem_narx import PEMNARX
 from .models.difference_equation import difference
 from .models.duffing import duffing
 from .models.model import Model
+from .models.named_parameters import Parameters
 from .online import OnlineEstimator
 from .priors import paper_text_prior, published_run_prior, recorded_prior, silverbox_prior, weak_prior
+from .rigs.channel import Channel
 from .rigs.physical_parameters import coefficients_of, to_physical
-from .rigs.rig import Channel, Rig
+from .rigs.rig import Rig
+from .rigs.silverbox_constants import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 from .saving import load_estimator, save_estimator
-from .support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 
 __all__ = [
     "PEMNARX",

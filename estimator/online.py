@@ -15,7 +15,8 @@ from estimator.inference.noise_grid import NoiseGridSize, NoiseRatio
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.priors import recorded_prior, silverbox_prior
-from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import rig_prior
 from estimator.settings import EstimatorSettings, checked_settings
 from estimator.support.argument_checks import to_finite_series, to_scalar

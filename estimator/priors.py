@@ -13,6 +13,7 @@ from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.silverbox_constants import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN
 from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import (
     check_bool,
@@ -22,7 +23,7 @@ from estimator.support.argument_checks import (
     short_repr,
     to_float_array,
 )
-from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN, FloatArray
+from estimator.support.array_types import FloatArray
 
 #: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
 #: converge to 1e-10 for every spread up to 0.999.

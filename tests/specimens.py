@@ -25,7 +25,7 @@ from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.pendulum import PENDULUM
 from estimator.priors import silverbox_prior
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
 # --- Models --------------------------------------------------------------------------------------------------------
 

@@ -81,7 +81,7 @@ def print_experiment_design(experiment_design: Any) -> None:
     from agents.console_output import format_table, print_warning
     from agents.console_output import print_texts_and_tables as print_all
     from agents.hardware.next_experiment import undersampling_message
-    from estimator.identification.diagnostics.validity_checks import MIN_SAMPLES_PER_PERIOD
+    from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD
     from estimator.rigs.units import digits_to_distinguish
 
     # A mean that differs from 0 by rounding alone is 0.

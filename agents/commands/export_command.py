@@ -42,7 +42,7 @@ class ExportCommand:
         from agents.cli import check_not_overwritten
         from agents.console_output import print_wrapped
         from agents.policies.signal_export import export_signal
-        from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+        from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
         check_not_overwritten("output", self.output, self.force)
         if self.output.suffix == ".onnx":

@@ -38,7 +38,7 @@ class RigInitCommand:
     def run(self) -> None:
         """Write it."""
         from agents.cli import check_not_overwritten
-        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, to_toml
+        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record
         from agents.console_output import print_wrapped
         from estimator.rigs.rig import SHIPPED_RIGS
         from estimator.support.file_io import write_atomically
@@ -49,7 +49,7 @@ class RigInitCommand:
                 raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")
         summary = ""
         if self.source is None:
-            text = to_toml(ask_for_rig())
+            text = ask_for_rig().to_toml()
         elif self.source in SHIPPED_RIGS:
             text = SHIPPED_RIGS[self.source].read_text(encoding="utf-8")
         else:

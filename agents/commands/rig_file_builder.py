@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from estimator.identification.data.record_reader import read_record_file
+from estimator.identification.data.record_files import read_record_file
 from estimator.identification.data.text_tables import read_table
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
-from estimator.rigs.rig import INTERPOLATION_DEGREES, Channel, Rig
-from estimator.rigs.rig_toml import to_toml
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
 from estimator.rigs.units import conversion_factor, to_si_unit
 from estimator.support.argument_checks import mask_control_codes
 
@@ -47,7 +47,7 @@ def rig_text_from_record(
             raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
         rig = Rig(step, input=Channel(column=input_column), output=Channel(column=output_column))
         read_record_file(path, rig)
-        return to_toml(rig, f", from {mask_control_codes(path.name)}"), _sampling_step_sentence(step, "--step")
+        return rig.to_toml(f", from {mask_control_codes(path.name)}"), _sampling_step_sentence(step, "--step")
     table = read_table(path, input_column, output_column)
     step_of_times = table.step()
     if step is None and step_of_times is None:
@@ -86,7 +86,7 @@ def rig_text_from_record(
         if one and base and conversion_factor(one, base) != 1.0:
             sentences.append(f"The {name} is in {one}, and is taken in {base}: results are in units of SI.")
     note = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
-    return to_toml(rig, f", from {mask_control_codes(path.name)}{note}"), "\n".join(sentences)
+    return rig.to_toml(f", from {mask_control_codes(path.name)}{note}"), "\n".join(sentences)
 
 
 def _sampling_step_sentence(step: float, source: str) -> str:

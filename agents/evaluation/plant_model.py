@@ -9,8 +9,9 @@ import numpy as np
 from duffing_env.storage.kernel_spec import noise_std_rows
 from estimator.belief import Belief
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import coefficients_of
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 
 
 class PlantModel(NamedTuple):

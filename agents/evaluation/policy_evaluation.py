@@ -29,11 +29,12 @@ from estimator.inference.batch_posteriors import posteriors
 from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import MAX_SEED, check_integer, mask_control_codes
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.

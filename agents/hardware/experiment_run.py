@@ -27,7 +27,7 @@ from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
 from estimator.belief import Belief
 from estimator.identification.data.text_tables import read_table
-from estimator.identification.diagnostics.validity_checks import disturbance_message
+from estimator.identification.diagnostics.equation_checks import disturbance_message
 from estimator.identification.fitting.posterior_belief import disturbance_std
 from estimator.rigs.rig import Rig
 from estimator.saving import save_estimator

@@ -28,10 +28,7 @@ from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
 from estimator.belief import Belief, covariance_indices
 from estimator.identification.data.column_names import name_with_unit, unit_in_name
-from estimator.identification.diagnostics.validity_checks import (
-    MIN_SAMPLES_PER_PERIOD,
-    RECOMMENDED_SAMPLES_PER_PERIOD,
-)
+from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD, RECOMMENDED_SAMPLES_PER_PERIOD
 from estimator.inference.free_run import free_run
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.rig import Rig

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from duffing_env.plants.silverbox_record import regime_input
 from estimator.models.difference_equation import difference
 from estimator.rigs.physical_parameters import coefficients_of
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.support.argument_checks import check_integer
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.support.array_types import FloatArray
 
 SignalDraw = Callable[[np.random.Generator, int], NDArray[np.float64]]
 

@@ -24,8 +24,8 @@ from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
 from agents.predict_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import to_float_array
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 BRAKE_FRACTION = 0.7
 """Amplitude beyond which the policies brake, in parts of the displacement that ends the episode.

@@ -12,8 +12,8 @@ from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, InputLimits
 from agents.predict_checks import MAX_SAMPLES
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import MAX_SEED, check_integer, did_you_mean, short_repr
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 from estimator.support.file_io import write_atomically
 
 

@@ -16,6 +16,7 @@ from agents.planning.model_probe import believed_resonance
 from agents.policies.excitations import EXCITATIONS, SignalDraw, draw_recorded
 from agents.predict_checks import MAX_SAMPLES, check_batch_size, check_state, episode_starts
 from estimator.belief import Belief
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import (
     MAX_SEED,
     MIN_MAGNITUDE,
@@ -24,7 +25,6 @@ from estimator.support.argument_checks import (
     short_repr,
     to_float_array,
 )
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 # Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]

@@ -9,7 +9,6 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from agents.commands import main
-from agents.commands.rig_file_builder import to_toml
 from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG
@@ -34,7 +33,7 @@ def calls() -> st.SearchStrategy[Call]:
     """Calls of the command."""
     place = Path(tempfile.mkdtemp(prefix="fuzz-"))
     os.chdir(place)
-    Path("rig.toml").write_text(to_toml(RIG, ""))
+    Path("rig.toml").write_text(RIG.to_toml())
     Path("record.csv").write_text("u,y\n" + "1,2\n" * 60)
     Path("board.jsonl").write_text(SHIPPED_LEADERBOARD.read_text().splitlines()[0] + "\n{}\n")
     Path("short.csv").write_text("u,y\n1,2\n")

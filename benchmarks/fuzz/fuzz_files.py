@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from agents.commands.rig_file_builder import to_toml
 from agents.leaderboard import leaderboard_file
 from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE, load_policy
 from agents.training.checkpoints import STATE_FILE, TrainingProgress, load_progress
@@ -20,7 +19,7 @@ from benchmarks.fuzz.bad_values import another_array, changed, damaged
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG, begun, sound, suppress_overflow
 from estimator import OnlineEstimator, Rig, load_estimator, save_estimator
-from estimator.identification.data.record_reader import read_record_file
+from estimator.identification.data.record_files import read_record_file
 
 _RECORD = b"time [s],force [N],displacement [m]\n" + b"".join(
     f"{k * 1e-3:.3f},{k % 7 - 3},{1e-3 * (k % 5)}\n".encode() for k in range(60)
@@ -78,7 +77,7 @@ def calls() -> st.SearchStrategy[Call]:
     fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
     #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
     others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
-        "rig": ("file", to_toml(RIG, "").encode(), Rig.from_file, (), ""),
+        "rig": ("file", RIG.to_toml().encode(), Rig.from_file, (), ""),
         "csv": ("record.csv", _RECORD, lambda path: read_record_file(path, RIG), (), ""),
         "mat": ("record.mat", matlab.getvalue(), lambda path: read_record_file(path, RIG), (), ""),
         "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),

@@ -22,7 +22,8 @@ from benchmarks.rigs.dop853_simulator import SENSOR_KINDS, FloatArray, simulate
 from benchmarks.rigs.rig_accuracy import format_percents
 from benchmarks.rigs.simulated_records import draw_guess, rng_stream
 from estimator.belief import Belief
-from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import rig_prior
 
 #: Policies that choose the inputs.

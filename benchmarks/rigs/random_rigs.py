@@ -21,7 +21,8 @@ from agents import console_output
 from benchmarks.rigs.bench_catalogue import PARAMETERS
 from benchmarks.rigs.calibration import INTERVAL_PROBABILITY, compare_to_truth, run_in_processes
 from benchmarks.rigs.dop853_simulator import SENSOR_KINDS, FloatArray, simulate
-from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import Rig
 
 SPRINGS = ("hardening", "softening", "wells")
 UNIT_OF_KIND = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}

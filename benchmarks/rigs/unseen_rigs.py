@@ -13,7 +13,8 @@ import numpy as np
 
 from agents import console_output
 from agents.training.environments.oscillator_family import FamilyMember
-from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import Rig
 from research.studies.unseen_oscillators import PLANNER, play_episode
 
 UNSEEN_RIGS = {

@@ -27,7 +27,7 @@ import platformdirs
 import scipy
 from numpy.typing import NDArray
 
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
 ENVIRONMENT_VARIABLE = "SILVERBOX_DATA"
 CSV_NAME = "SNLS80mV.csv"

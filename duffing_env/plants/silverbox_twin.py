@@ -10,8 +10,8 @@ import numpy as np
 
 from duffing_env.plants.silverbox_record import SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, duffing
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import to_physical
-from estimator.support.array_types import Parameters
 
 
 def identify_difference_twin(record: SilverboxRecord) -> tuple[Parameters, float]:

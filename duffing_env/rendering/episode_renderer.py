@@ -16,10 +16,11 @@ import numpy.typing as npt
 from duffing_env.rendering.plot_panels import GREY, INK, RULE, ParameterPanel, SignalPanel
 from estimator.belief import Belief
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 from estimator.rigs.units import SUPERSCRIPTS, VOLT_SCALES, Scales
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 from estimator.support.optional_dependencies import require_packages
 
 Frame = npt.NDArray[np.uint8]

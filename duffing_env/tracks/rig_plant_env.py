@@ -20,11 +20,11 @@ from duffing_env.rewards.reward_registry import kernel_reward
 from estimator.belief import Belief
 from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import equal_effect_log_ratio, reset_state, rig_prior
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import check_integer, short_repr
-from estimator.support.array_types import Parameters
 
 RigLike = Rig | Mapping[str, Any] | str | Path
 

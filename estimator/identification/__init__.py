@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from estimator.identification.data.record_reader import Record, read_records
+from estimator.identification.data.record import Record
+from estimator.identification.data.record_reader import read_records
 from estimator.identification.diagnostics.validity_checks import run_all_checks
 from estimator.identification.fitting.multistart_search import search_coefficients, spread_along_ridge
 from estimator.identification.fitting.posterior_belief import (
@@ -24,14 +25,13 @@ from estimator.identification.likelihood.identification_problem import (
     MAX_UNSTATED_DELAY,
     TARGET_PARAMETERS,
     IdentificationProblem,
-    mask_unexplained_outputs,
 )
+from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
-from estimator.support.progress import ignore_progress
-from estimator.support.progress import show_progress
+from estimator.support.progress import ignore_progress, show_progress
 
 
 def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: bool = False) -> Result:

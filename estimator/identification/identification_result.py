@@ -11,32 +11,16 @@ from typing import TypeVar
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.identification.data.record_reader import Record
+from estimator.identification.data.record import Record
+from estimator.identification.diagnostics.check_finding import CheckFinding
 from estimator.identification.fitting.posterior_belief import ContractionHistory
-from estimator.identification.fitting.profile_likelihood import RidgePosterior
+from estimator.identification.fitting.ridge_posterior import RidgePosterior
+from estimator.identification.identification_report import ReportContent, write_report
+from estimator.identification.report_figures import FREE_RUN_OUTPUTS
 from estimator.online import OnlineEstimator
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import digits_to_distinguish
 from estimator.support.array_types import FloatArray
-
-
-@dataclass(frozen=True)
-class CheckFinding:
-    """What a check found.
-
-    Attributes:
-        name: of the check, such as ``"delay"``.
-        message: what was found, and what to do, in plain words.
-        parameters: those that it is about, where it is about some.
-    """
-
-    name: str
-    message: str
-    parameters: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.message}"
-
 
 _Value = TypeVar("_Value")
 
@@ -154,9 +138,20 @@ class Result:
             path: of the page; its folder is made.
             commands: that made it, to be shown.
         """
-        from estimator.identification.identification_report import write_report
-
-        return write_report(self, Path(path), commands)
+        content = ReportContent(
+            self.rig,
+            self.parameters,
+            self.interval(0.9),
+            self.units,
+            self.unidentified,
+            self.noises,
+            self.warnings,
+            self.records,
+            self.forecasts,
+            self.compute_forecasts(FREE_RUN_OUTPUTS),
+            self.history,
+        )
+        return write_report(content, Path(path), commands)
 
     def __str__(self) -> str:
         intervals, units = self.interval(0.9), self.units

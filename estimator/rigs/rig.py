@@ -14,13 +14,14 @@ import numpy as np
 
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.models.model import Model
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig_toml import rig_file_text
 from estimator.rigs.units import MAGNITUDE_BOUNDS, Scales, sensor_kind_of_unit
 from estimator.support.argument_checks import (
     check_choice,
     check_integer,
     check_number,
     did_you_mean,
-    mask_control_codes,
     short_repr,
 )
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
@@ -41,58 +42,6 @@ _MAX_FILE_BYTES = 2**20
 SHIPPED_RIGS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"), key=lambda p: p.stem)}
 
 _GUESSED_PARAMETERS = ("m", "c", "a", "b")
-
-
-@dataclass(frozen=True)
-class Channel:
-    """The input or the output of a rig.
-
-    Attributes:
-        unit: such as ``"N"``, ``"V"``, ``"mm"`` or ``"m/s"``.
-        limit: of an input: never exceeded, in either direction. None: not known.
-        range: of an output: an experiment stops outside of it, in either direction. None: not known.
-        kind: what an output shows: ``displacement``, ``velocity`` or ``acceleration``.
-        noise: standard deviation, per sample: of an output its sensor's, of an input what disturbs the force. A first
-            value of what stays unknown; None: nothing is known of it.
-        offset: first value of the offset, which stays unknown. `identify` takes outputs that lie far from 0 as they
-            are; a rig that is played has a range about 0.
-        lag: of an input: time constant [s] of a first-order lag between what is recorded and what acts, such as of a
-            voice coil. For `identify` alone. None: none.
-        column: its name in CSV files, with or without the unit behind it, or in MAT files. None stands for the usual
-            names (`estimator.identification.data.text_tables.read_table`).
-
-    Raises:
-        ValueError: naming the argument, the value and the remedy.
-    """
-
-    unit: str = "1"
-    limit: float | None = None
-    range: float | None = None
-    kind: str = "displacement"
-    noise: float | None = None
-    offset: float = 0.0
-    column: str | None = None
-    lag: float | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.unit, str) or not self.unit.strip() or len(self.unit) > 40:
-            raise ValueError(f"unit must be a short text such as 'N', but is {self.unit!r:.60}; '1' is a pure number")
-        if mask_control_codes(self.unit) != self.unit or set(self.unit) & set(
-            ',;"[]'
-        ):  # it stands in heads of CSV files
-            raise ValueError(f"unit must hold no control codes, commas, quotes or brackets, but is {self.unit!r:.60}")
-        for name in ("limit", "range", "noise", "lag"):
-            value = getattr(self, name)
-            if value is not None:
-                of = {"limit": " of an input", "range": " of an output"}.get(name, "")
-                check_number(f"{name}{of}", value, *MAGNITUDE_BOUNDS, "leave it out where it is not known")
-        check_choice("kind", self.kind, DERIVATIVE_ORDER_OF_SENSOR)
-        check_number("offset", self.offset, -MAGNITUDE_BOUNDS[1], MAGNITUDE_BOUNDS[1], "0 where nothing is known")
-        if self.column is not None:
-            if not isinstance(self.column, str) or not 0 < len(self.column.strip()) <= 80:
-                raise ValueError(f"column must be a name in the records' files, but is {self.column!r:.60}")
-            if mask_control_codes(self.column) != self.column or set(self.column) & set(',;"'):
-                raise ValueError(f"column must hold no control codes, commas or quotes, but is {self.column!r:.60}")
 
 
 @dataclass(frozen=True)
@@ -263,9 +212,18 @@ class Rig:
             >>> Rig.from_file("rig.toml") == rig
             True
         """
-        from estimator.rigs.rig_toml import to_toml
+        write_atomically(to_path("path", path), self.to_toml())
 
-        write_atomically(to_path("path", path), to_toml(self))
+    def to_toml(self, provenance: str = "") -> str:
+        """The text of a rig file, with comments; an unknown value is a comment to fill in.
+
+        Args:
+            provenance: source of the numbers, for the first line, such as ``", from record.csv"``.
+        """
+        units = {name: self.scales.unit(self.model.dimensions[name]) for name in _GUESSED_PARAMETERS}
+        return rig_file_text(
+            self.step, self.interpolation, self.delay, self.input, self.output, self.guess, units, provenance
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """What JSON and TOML can hold, without what was left out."""

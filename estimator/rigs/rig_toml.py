@@ -1,12 +1,11 @@
-"""The file of a rig, for people: TOML with comments."""
+"""The rig file: TOML with comments, and with unknown values as comments to fill in."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-if TYPE_CHECKING:
-    from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.channel import Channel
 
 _EQUATION_COMMENT = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   seen: {seen} + y0 + noise"
 _SYMBOL_OF_KIND = {"displacement": "x", "velocity": "x'", "acceleration": "x''"}
@@ -20,51 +19,66 @@ _ACCELERATION_COMMENT = (
 _UNIT_COMMENT = '  # such as "N", "V", "mm" or "m/s"; "1" is a pure number'
 
 
-def to_toml(rig: Rig, provenance: str = "") -> str:
-    """The file of a rig, with comments; what is not known stands there as a comment to be filled in.
+def rig_file_text(
+    step: float,
+    interpolation: str,
+    delay: float,
+    input_channel: Channel,
+    output_channel: Channel,
+    guess: Mapping[str, tuple[float, float]] | None,
+    units_of_guess: Mapping[str, str],
+    provenance: str = "",
+) -> str:
+    """The text of a rig file, with comments; an unknown value is a comment to fill in.
 
     Args:
-        rig: the rig.
-        provenance: where its numbers are from.
+        step: sampling step [s].
+        interpolation: of the input.
+        delay: of the input [samples].
+        input_channel: the input.
+        output_channel: the output.
+        guess: parameter to its 90 % interval, or None.
+        units_of_guess: parameter to its unit.
+        provenance: source of the numbers, for the first line, such as ``", from record.csv"``.
     """
-    source, sink = rig.input, rig.output
     lines = [
         f"# A rig{provenance}. Read by: duffing-env identify, and Rig.from_file.",
-        _EQUATION_COMMENT.format(seen=_SYMBOL_OF_KIND[sink.kind]),
+        _EQUATION_COMMENT.format(seen=_SYMBOL_OF_KIND[output_channel.kind]),
         "",
-        f"step = {float(rig.step)!r}  # s between samples",
+        f"step = {float(step)!r}  # s between samples",
         _INTERPOLATION_COMMENT,
-        f"interpolation = {_quote(rig.interpolation)}",
-        f"delay = {rig.delay:.12g}  # samples by which the input acts later",
+        f"interpolation = {_quote(interpolation)}",
+        f"delay = {delay:.12g}  # samples by which the input acts later",
         "",
         "[input]",
-        f"unit = {_quote(source.unit)}{_UNIT_COMMENT if source.unit == '1' else ''}",
-        *_column_lines(source),
-        _value_or_placeholder("limit", source.limit, "never exceeded, in either direction"),
+        f"unit = {_quote(input_channel.unit)}{_UNIT_COMMENT if input_channel.unit == '1' else ''}",
+        *_column_lines(input_channel),
+        _value_or_placeholder("limit", input_channel.limit, "never exceeded, in either direction"),
         *_optional_lines(
-            "lag", source.lag, "s, time constant of a first-order lag between what is recorded and what acts"
+            "lag", input_channel.lag, "s, time constant of a first-order lag between what is recorded and what acts"
         ),
-        *_optional_lines("noise", source.noise, "standard deviation of what disturbs the force"),
-        *_optional_lines("offset", source.offset or None, "u0, a first value"),
+        *_optional_lines("noise", input_channel.noise, "standard deviation of what disturbs the force"),
+        *_optional_lines("offset", input_channel.offset or None, "u0, a first value"),
         "",
         "[output]",
-        f"unit = {_quote(sink.unit)}{_UNIT_COMMENT if sink.unit == '1' else ''}",
-        *_column_lines(sink),
-        f"kind = {_quote(sink.kind)}  # displacement, velocity or acceleration",
-        *([_ACCELERATION_COMMENT] if sink.kind == "acceleration" else []),
-        _value_or_placeholder("range", sink.range, "an experiment stops outside of it, in either direction"),
-        _value_or_placeholder("noise", sink.noise, "standard deviation of the sensor's noise, where you know it"),
-        *_optional_lines("offset", sink.offset or None, "y0, a first value"),
+        f"unit = {_quote(output_channel.unit)}{_UNIT_COMMENT if output_channel.unit == '1' else ''}",
+        *_column_lines(output_channel),
+        f"kind = {_quote(output_channel.kind)}  # displacement, velocity or acceleration",
+        *([_ACCELERATION_COMMENT] if output_channel.kind == "acceleration" else []),
+        _value_or_placeholder("range", output_channel.range, "an experiment stops outside of it, in either direction"),
+        _value_or_placeholder(
+            "noise", output_channel.noise, "standard deviation of the sensor's noise, where you know it"
+        ),
+        *_optional_lines("offset", output_channel.offset or None, "y0, a first value"),
         "",
         "# What you believe before any record: a low and a high end for each, which hold it with 90 %.",
         "# identify needs none of it.",
     ]
-    units = {name: rig.scales.unit(rig.model.dimensions[name]) for name in "mcab"}
-    if rig.guess is None:
-        lines += ["# [guess]", *(f"# {name} = [low, high]  # {units[name]}" for name in units)]
+    if guess is None:
+        lines += ["# [guess]", *(f"# {name} = [low, high]  # {unit}" for name, unit in units_of_guess.items())]
     else:
         lines.append("[guess]")
-        lines += [f"{name} = [{low!r}, {high!r}]  # {units[name]}" for name, (low, high) in rig.guess.items()]
+        lines += [f"{name} = [{low!r}, {high!r}]  # {units_of_guess[name]}" for name, (low, high) in guess.items()]
     return "\n".join([*lines, ""])
 
 

@@ -12,8 +12,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import check_number
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 #: Powers of the input's unit, the displacement's unit and the second.
 UnitPowers = tuple[int, int, int]

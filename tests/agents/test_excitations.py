@@ -16,9 +16,10 @@ from agents.policies.signals import InputLimits, SignalPolicy
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference_equation import difference
+from estimator.models.named_parameters import Parameters
 from estimator.priors import silverbox_prior
 from estimator.rigs.physical_parameters import coefficients_of
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 RECORDED = ("silverbox-multisine", "silverbox-arrow")

@@ -31,7 +31,7 @@ from estimator.models.duffing import duffing
 from estimator.models.model import Model
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 from estimator.priors import silverbox_prior
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
 
 def make(track, n, **options):

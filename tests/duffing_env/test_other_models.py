@@ -7,11 +7,11 @@ from reference.filters import Plant, moved
 from specimens import COMPILED, SEEN_TWICE
 
 from duffing_env.tracks.model_env import ModelEnv, ModelExperiment
+from estimator.models.named_parameters import Parameters
 from estimator.models.pendulum import PENDULUM, PENDULUM_SAMPLING_STEP
 from estimator.priors import log_uniform_moments
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.units import Scales
-from estimator.support.array_types import Parameters
 
 (OWN,) = (environment for environment in COMPILED if environment.name == "own model")
 PENDULA = {"p1": 14.7, "p2": 0.5, "p3": 3.0}

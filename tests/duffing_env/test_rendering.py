@@ -21,8 +21,9 @@ from duffing_env.rendering import episode_renderer
 from duffing_env.rendering.episode_renderer import HEIGHT, MAX_SAMPLES_SHOWN, WIDTH, EpisodeRenderer
 from duffing_env.tracks.model_env import ModelExperiment
 from estimator.engine.storage_layout import belief_rows
+from estimator.models.named_parameters import Parameters
 from estimator.priors import silverbox_prior
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 
 PRIOR = silverbox_prior()
 

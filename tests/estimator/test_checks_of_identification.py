@@ -9,8 +9,8 @@ import pytest
 from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
-from estimator.identification.data.record_reader import Record
-from estimator.identification.diagnostics.validity_checks import _check_outliers, _check_short_impacts
+from estimator.identification.data.record import Record
+from estimator.identification.diagnostics.record_checks import _check_outliers, _check_short_impacts
 
 GUESS = {name: tuple(sorted((0.7 * value, 1.4 * value))) for name, value in BENCH[0].items()}
 

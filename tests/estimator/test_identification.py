@@ -7,13 +7,10 @@ import pytest
 from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struck
 
 from estimator import Channel, Rig, identify
-from estimator.identification.likelihood.identification_problem import (
-    MAX_UNSTATED_DELAY,
-    IdentificationProblem,
-    mask_unexplained_outputs,
-)
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
+from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
 from estimator.identification.likelihood.initial_states import find_initial_states
-from estimator.identification.likelihood.laplace_fit import FitHypothesis
+from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
 from estimator.inference.free_run import free_run
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.rigs.physical_parameters import coefficients_of

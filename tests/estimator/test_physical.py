@@ -13,10 +13,11 @@ from tables import table
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 from estimator.models.pendulum import PENDULUM
 from estimator.rigs.physical_parameters import coefficients_of, physical_jacobian, propagate_to_physical, to_physical
+from estimator.rigs.silverbox_constants import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP
 from estimator.rigs.units import Scales
-from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, Parameters
 
 EPS = np.finfo(float).eps
 PAPER = difference()

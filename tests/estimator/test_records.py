@@ -9,7 +9,8 @@ from tables import table
 
 from estimator import Channel, Rig, identify
 from estimator.identification.data import record_reader
-from estimator.identification.data.record_reader import find_clipped_outputs, read_records
+from estimator.identification.data.record_cleaning import find_clipped_outputs
+from estimator.identification.data.record_reader import read_records
 
 
 def read(path, rig):
@@ -234,7 +235,7 @@ def test_a_mat_file_is_read_by_nothing_that_lies_beside_it_and_not_for_ever(tmp_
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was executed')")
     np.testing.assert_array_equal(read("r.mat", Rig(0.01))[1], y)
     monkeypatch.setattr(
-        "estimator.identification.data.record_reader._MAT_TIMEOUT", 0.0
+        "estimator.identification.data.mat_files._MAT_TIMEOUT", 0.0
     )  # which no machine is quick enough for
     with pytest.raises(ValueError, match=r"r\.mat must be a MAT file that can be read within 0 s, but was not"):
         read("r.mat", Rig(0.01))

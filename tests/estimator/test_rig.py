@@ -15,8 +15,8 @@ from estimator import Channel, OnlineEstimator, Rig, load_estimator, save_estima
 from estimator.rigs.electronic_duffing import electronic_duffing
 from estimator.rigs.rig import SHIPPED_RIGS
 from estimator.rigs.rig_prior import rig_prior
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.rigs.units import Scales
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
 
 GUESS = {"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (-1e8, 1e8)}
 BENCH = Rig(1e-3, input=Channel("N", limit=20.0), output=Channel("m", range=0.03), guess=GUESS)

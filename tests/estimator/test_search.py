@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from estimator.identification.fitting.multistart_search import fit_noise_ratio
-from estimator.identification.likelihood.laplace_fit import FitHypothesis, LaplaceFits, invert_batch, solve_batch
+from estimator.identification.fitting.noise_ratio_fit import fit_noise_ratio
+from estimator.identification.likelihood.batch_linear_algebra import invert_batch, solve_batch
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis, LaplaceFits
 
 REGULAR, SINGULAR = np.array([[2.0, 1.0], [1.0, 4.0]]), np.array([[1.0, 1.0], [1.0, 1.0]])
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimator.identification.fitting.multistart_search import SearchResult, search_coefficients
-from estimator.identification.identification_result import CheckFinding
+from estimator.identification.diagnostics.check_finding import CheckFinding
+from estimator.identification.fitting.multistart_search import search_coefficients
+from estimator.identification.fitting.search_result import SearchResult
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT, belief_from_moments

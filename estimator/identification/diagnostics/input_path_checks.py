@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.identification.fitting.multistart_search import SearchResult
-from estimator.identification.identification_result import CheckFinding
+from estimator.identification.diagnostics.check_finding import CheckFinding
+from estimator.identification.fitting.search_result import SearchResult
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
 from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
-from estimator.identification.likelihood.laplace_fit import FitHypothesis, LaplaceFitter
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, INTERPOLATION_DEGREES, MAX_DELAY
 from estimator.support.array_types import FloatArray
 

@@ -8,10 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.belief import Belief
-from estimator.identification.fitting.multistart_search import SearchResult, fit_noise_ratio
-from estimator.identification.likelihood.identification_problem import IdentificationProblem, mask_unexplained_outputs
+from estimator.identification.fitting.noise_ratio_fit import fit_noise_ratio
+from estimator.identification.fitting.search_result import SearchResult
+from estimator.identification.likelihood.fit_hypothesis import CoefficientPrior, FitHypothesis
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.initial_states import find_initial_states
-from estimator.identification.likelihood.laplace_fit import CoefficientPrior, FitHypothesis, LaplaceFitter
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
 from estimator.inference.fisher_information import filter_records
 from estimator.inference.noise_grid import moment_matched_gamma
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR

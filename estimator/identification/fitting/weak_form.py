@@ -18,7 +18,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from estimator.identification.likelihood.identification_problem import IdentificationProblem, interpolate_gaps
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.problem_signals import interpolate_gaps
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.support.array_types import FloatArray
 
@@ -130,20 +131,6 @@ def random_starts(problem: IdentificationProblem, count: int, seed: int) -> list
 def input_effect_rms(problem: IdentificationProblem, coefficients: FloatArray) -> float:
     """Root mean square of what the inputs do to the motion at coefficients (K,), in the unit of the process noise."""
     return abs(float(coefficients[list(problem.model.coefficients).index("gain")])) * problem.input_rms
-
-
-def well_displacements(problem: IdentificationProblem, coefficients: FloatArray) -> FloatArray:
-    """(n, P) displacements at which the spring of some of the coefficients (P, K) is without force, beside its middle.
-
-    None where no spring has two wells; 0 for one that has not.
-    """
-    names = list(problem.model.coefficients)
-    stiffness, cubic = coefficients[:, names.index("stiffness")], coefficients[:, names.index("cubic")]
-    has_two_wells = (stiffness < 0) & (cubic > 0)
-    if not has_two_wells.any():
-        return np.empty((0, len(coefficients)))
-    distance = np.sqrt(np.divide(-stiffness, cubic, out=np.zeros(len(coefficients)), where=has_two_wells))
-    return np.stack([distance, -distance])
 
 
 def _spring_centres(problem: IdentificationProblem) -> list[float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,10 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.data.nonuniform_sampling import resample_on_knots
-from estimator.inference.input_interpolation import input_stencil
+from estimator.identification.likelihood.problem_signals import (
+    filter_input_rows,
+    interpolate_gaps,
+    mask_unexplained_outputs,
+    shift_output_origin,
+    sliding_sums,
+    stack_padded,
+)
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
 from estimator.models.model import Model
-from estimator.rigs.rig import INTERPOLATION_DEGREES, Channel, Rig
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
 
@@ -27,7 +34,6 @@ TARGET_PARAMETERS = tuple(PARAMETER_DIMENSIONS)
 
 #: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
 OPTIONAL_TERMS = ("cubic_damping", "quintic", "dry_friction")
-
 
 #: Speed below which dry friction fades, in parts of the usual one.
 _CREEP_SPEED_FRACTION = 0.05
@@ -118,18 +124,18 @@ class IdentificationProblem:
         if self.times is None and delay == int(delay) and not lag:
             # A record's first output comes before its first input acts, however the input goes.
             rig = replace(self.rig, interpolation=interpolation, delay=int(delay), input=Channel())
-            inputs = _stack_padded([filter_input_rows(self.model, rig, u) for u in self.u], rows)
+            inputs = stack_padded([filter_input_rows(self.model, rig, u) for u in self.u], rows)
             places = tuple(np.arange(len(y)) for y in self.y)
-            return FilterSamples(inputs, _stack_padded([y[:, None] for y in self.y], 1), None, places)
+            return FilterSamples(inputs, stack_padded([y[:, None] for y in self.y], 1), None, places)
         laid_records = [
             resample_on_knots(times, u, y, interpolation, delay, lag)
             for times, u, y in zip(self.times_in_steps, self.u, self.y, strict=True)
         ]
         rows = max(rows, *(one.inputs.shape[1] for one in laid_records))
-        spans = _stack_padded([one.spans[:, None] for one in laid_records], 1)[:, :, 0]
+        spans = stack_padded([one.spans[:, None] for one in laid_records], 1)[:, :, 0]
         return FilterSamples(
-            _stack_padded([one.inputs for one in laid_records], rows),
-            _stack_padded([one.outputs[:, None] for one in laid_records], 1),
+            stack_padded([one.inputs for one in laid_records], rows),
+            stack_padded([one.outputs[:, None] for one in laid_records], 1),
             spans,
             tuple(one.output_indices for one in laid_records),
         )
@@ -152,11 +158,11 @@ class IdentificationProblem:
 
     def moments_about_origin(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
-        return _shift_output_origin(self.model, mean, cov, self.origin)
+        return shift_output_origin(self.model, mean, cov, self.origin)
 
     def moments_about_zero(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The moments of which `moments_about_origin` makes these."""
-        return _shift_output_origin(self.model, mean, cov, -self.origin)
+        return shift_output_origin(self.model, mean, cov, -self.origin)
 
     def truncated(self, max_samples: int) -> IdentificationProblem:
         """The same with the first samples of each record only."""
@@ -190,7 +196,7 @@ class IdentificationProblem:
         """
         segments = []
         for record, (u, y) in enumerate(zip(self.u, self.y, strict=True)):
-            power = _sliding_sums((u - u.mean()) ** 2, segment_length) * _sliding_sums(
+            power = sliding_sums((u - u.mean()) ** 2, segment_length) * sliding_sums(
                 np.isfinite(y).astype(float), segment_length
             )
             begin = 0
@@ -201,7 +207,7 @@ class IdentificationProblem:
 
     def largest_output_segment(self, segment_length: int) -> tuple[int, int]:
         """The number of a record, and the sample that a piece of so many begins with, of the largest outputs."""
-        powers = [_sliding_sums(np.nan_to_num(y) ** 2, segment_length) for y in self.y]
+        powers = [sliding_sums(np.nan_to_num(y) ** 2, segment_length) for y in self.y]
         record = int(np.argmax([power.max() for power in powers]))
         return record, int(powers[record].argmax())
 
@@ -273,79 +279,3 @@ class IdentificationProblem:
         # The speed below which friction fades is no matter of the records: a small part of the usual speed.
         creep = _CREEP_SPEED_FRACTION * self.mean_frequency * self.displacement
         return [(0.0, self.natural_coefficient_sizes()["friction"]), (creep, 0.01 * creep)]
-
-
-def interpolate_gaps(y: FloatArray, max_gap: float) -> FloatArray:
-    """Outputs (T,) with straight lines through gaps of no more than so many samples.
-
-    Example:
-        >>> interpolate_gaps(np.array([0.0, np.nan, 2.0, np.nan, np.nan, 5.0, np.nan]), 1)
-        array([ 0.,  1.,  2., nan, nan,  5., nan])
-    """
-    observed = np.flatnonzero(np.isfinite(y))
-    filled = y.copy()
-    gaps = np.diff(observed) - 1
-    for gap in np.flatnonzero((gaps > 0) & (gaps <= max_gap)):
-        before, after = observed[gap], observed[gap + 1]
-        filled[before : after + 1] = np.linspace(y[before], y[after], after - before + 1)
-    return filled
-
-
-def _sliding_sums(values: FloatArray, samples: int) -> FloatArray:
-    """Sums of pieces of so many values, one for each place where a piece may begin."""
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    samples = min(samples, len(values))
-    return np.asarray(sums[samples:] - sums[: len(sums) - samples])
-
-
-def mask_unexplained_outputs(y: FloatArray, rig: Rig, extra_delay: int = 0) -> FloatArray:
-    """Outputs (T,) of a record, NaN where inputs acted that came before it and that nobody recorded.
-
-    What these had done before the first output that is left does not count: the oscillator may be in any motion.
-
-    Args:
-        y: outputs.
-        rig: whose they are.
-        extra_delay: samples by which the input may be later than the rig says.
-    """
-    # An accelerometer shows the force itself, not only what it did.
-    n_masked = max(0, math.ceil(rig.delay)) + extra_delay + (DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind] == 2)
-    masked = y.copy()
-    masked[: min(n_masked, len(y) - 1)] = np.nan
-    return masked
-
-
-def filter_input_rows(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
-    """(T, rows) what a model takes over the sample before each output; after the last input it stays the same."""
-    input_feed = input_stencil(model, rig)
-    if input_feed.needs_whole_record:
-        return input_feed.spline_coefficients(u)
-    window = input_feed.stencil.shape[1]
-    lag = -1 if input_feed.lookahead else input_feed.n_past - (window - 1)
-    places = np.arange(len(u))[:, None] - lag - (window - 1) + np.arange(window)
-    acting = u[np.clip(places, 0, len(u) - 1)]
-    if not input_feed.repeats_first:
-        acting = np.where(places < 0, 0.0, acting)
-    return np.asarray(acting @ input_feed.stencil.T)
-
-
-def _shift_output_origin(
-    model: Model, mean: FloatArray, cov: FloatArray, origin: float
-) -> tuple[FloatArray, FloatArray]:
-    """Moments where outputs are counted from another origin, of a displacement: z'' = force - stiffness z + ..."""
-    jacobian, offset = np.eye(len(mean)), np.zeros(len(mean))
-    names = list(model.coefficients)
-    jacobian[names.index("force"), names.index("stiffness")] = -origin
-    offset[names.index("output_offset")] = -origin
-    shifted_cov = jacobian @ cov @ jacobian.T
-    # An inverse of what is nearly singular, such as what few samples tell, is symmetric to fewer digits than it has.
-    return jacobian @ mean + offset, (shifted_cov + shifted_cov.T) / 2
-
-
-def _stack_padded(series: list[FloatArray], columns: int) -> FloatArray:
-    """(n, T, columns) of n series: columns that one lacks are 0, and a shorter one ends with NaN."""
-    stacked = np.full((len(series), max(map(len, series)), columns), np.nan)
-    for row, one in zip(stacked, series, strict=True):
-        row[: len(one)] = 0.0
-        row[: len(one), : one.shape[1]] = one
-    return stacked

@@ -12,9 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from estimator.identification.fitting.weak_form import well_displacements
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
-from estimator.identification.likelihood.laplace_fit import FitHypothesis
 from estimator.inference.fisher_information import filter_records
 from estimator.support.array_types import FloatArray
 
@@ -139,3 +138,17 @@ def _initial_state_loss(
         return np.where(np.isfinite(loss), loss, np.inf).reshape(count, series)
 
     return losses
+
+
+def well_displacements(problem: IdentificationProblem, coefficients: FloatArray) -> FloatArray:
+    """(n, P) displacements at which the spring of some of the coefficients (P, K) is without force, beside its middle.
+
+    None where no spring has two wells; 0 for one that has not.
+    """
+    names = list(problem.model.coefficients)
+    stiffness, cubic = coefficients[:, names.index("stiffness")], coefficients[:, names.index("cubic")]
+    has_two_wells = (stiffness < 0) & (cubic > 0)
+    if not has_two_wells.any():
+        return np.empty((0, len(coefficients)))
+    distance = np.sqrt(np.divide(-stiffness, cubic, out=np.zeros(len(coefficients)), where=has_two_wells))
+    return np.stack([distance, -distance])

@@ -13,13 +13,22 @@ first outputs of a record, as many as there are states, do not count: any motion
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from estimator.identification.likelihood.batch_linear_algebra import (
+    invert_batch,
+    solve_batch,
+    solve_with_fixed_directions,
+)
+from estimator.identification.likelihood.fit_hypothesis import (
+    CoefficientPrior,
+    FitHypothesis,
+    LaplaceFits,
+)
 from estimator.identification.likelihood.identification_problem import FilterSamples, IdentificationProblem
 from estimator.inference.fisher_information import FilteredRecords, filter_records
 from estimator.support.array_types import FloatArray
@@ -45,90 +54,6 @@ _MIN_PROMISED_GAIN = 1e-2
 
 #: So many times what the last step gained is what a fit may still gain.
 _REMAINING_GAIN_FACTOR = 10.0
-
-
-@dataclass(frozen=True)
-class FitHypothesis:
-    """What is held for true while the coefficients are fitted.
-
-    Attributes:
-        interpolation: of the input.
-        delay: of the input, in samples.
-        lag: time constant of a first-order lag of the input, in samples.
-        noise_ratio: σ_w/σ_v inside.
-        initial_states: (records, 2) displacement and velocity a sample before each record, about which the filter is linear at
-            its first samples; at rest where it is None.
-    """
-
-    interpolation: str
-    delay: float
-    noise_ratio: float = 1.0
-    initial_states: FloatArray | None = field(default=None, compare=False)
-    lag: float = 0.0
-
-    @property
-    def input_path(self) -> tuple[str, float, float]:
-        """How the input went: interpolation, delay and lag."""
-        return self.interpolation, self.delay, self.lag
-
-
-@dataclass(frozen=True, eq=False)
-class CoefficientPrior:
-    """A Gaussian over the coefficients of `Problem.model`: mean (K,) and precision (K, K)."""
-
-    mean: FloatArray
-    precision: FloatArray
-
-    @classmethod
-    def of(cls, mean: FloatArray, cov: FloatArray) -> CoefficientPrior:
-        """That of given moments (K,) and (K, K)."""
-        scale = np.sqrt(np.diag(cov))
-        return cls(mean, np.linalg.inv(cov / np.outer(scale, scale)) / np.outer(scale, scale))
-
-    def extended(self, moments: Sequence[tuple[float, float]]) -> CoefficientPrior:
-        """With more coefficients, of means and standard deviations."""
-        n, means, stds = len(self.mean), [mean for mean, _ in moments], np.array([std for _, std in moments])
-        precision = np.zeros((n + len(stds),) * 2)
-        precision[:n, :n], precision[n:, n:] = self.precision, np.diag(stds**-2)
-        return CoefficientPrior(np.append(self.mean, means), precision)
-
-
-@dataclass(frozen=True, eq=False)
-class LaplaceFits:
-    """What became of H hypotheses.
-
-    Attributes:
-        hypotheses: in order.
-        mean: (H, K) most probable coefficients.
-        cov: (H, K, K) their covariance.
-        sensor_std: (H,) σ_v.
-        free_energy: (H,) in nats, up to a constant that all share; inf where the numbers ran away, or the records and
-            the prior leave a coefficient open.
-        loss: (H,) the part of it that is L.
-    """
-
-    hypotheses: tuple[FitHypothesis, ...]
-    mean: FloatArray
-    cov: FloatArray
-    sensor_std: FloatArray
-    free_energy: FloatArray
-    loss: FloatArray
-
-    def lowest_free_energy(self, count: int) -> LaplaceFits:
-        """Those of the lowest free energies, the lowest first."""
-        return self.select(np.argsort(self.free_energy, kind="stable")[:count])
-
-    def select(self, chosen: npt.NDArray[Any]) -> LaplaceFits:
-        """Those of some hypotheses, told by their numbers or by flags."""
-        kept = tuple(self.hypotheses[i] for i in np.arange(len(self.hypotheses))[chosen])
-        parts = (self.mean, self.cov, self.sensor_std, self.free_energy, self.loss)
-        return LaplaceFits(kept, *(part[chosen] for part in parts))
-
-    @classmethod
-    def concatenated(cls, batches: Sequence[LaplaceFits]) -> LaplaceFits:
-        """All of several."""
-        parts = zip(*((f.mean, f.cov, f.sensor_std, f.free_energy, f.loss) for f in batches), strict=True)
-        return cls(tuple(h for f in batches for h in f.hypotheses), *(np.concatenate(part) for part in parts))
 
 
 class _FilterInputs(NamedTuple):
@@ -225,7 +150,7 @@ class LaplaceFitter:
             step = -(
                 solve_batch(damped, gradient[active])
                 if scaled_directions is None
-                else _solve_with_fixed_directions(damped, gradient[active], scaled_directions[active])
+                else solve_with_fixed_directions(damped, gradient[active], scaled_directions[active])
             )
             promised = -0.5 * np.einsum("hk,hk->h", gradient[active], step)
             trial = points[active] + self._scale * step
@@ -342,47 +267,3 @@ class LaplaceFitter:
     def _in_prior_units(self, precision: FloatArray) -> FloatArray:
         """A precision of the coefficients, of these in standard deviations of the prior."""
         return precision * np.outer(self._scale, self._scale)
-
-
-def _with_unit_diagonal(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Matrices with 1 on their diagonals, and the roots of those that they had."""
-    root = np.sqrt(np.einsum("hii->hi", matrices))
-    return matrices / (root[:, :, None] * root[:, None, :]), root
-
-
-def solve_batch(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(H, K) solutions; zeros where a matrix is singular."""
-    unit, root = _with_unit_diagonal(matrices)
-    return _solve_each_if_singular(np.linalg.solve, 0.0, unit, (vectors / root)[:, :, None])[:, :, 0] / root
-
-
-def _solve_with_fixed_directions(matrices: FloatArray, vectors: FloatArray, directions: FloatArray) -> FloatArray:
-    """(H, K) solutions in the planes that are at right angles to the pins (H, K)."""
-    unit, root = _with_unit_diagonal(matrices)
-    plane = np.linalg.qr((directions / root)[:, :, None], mode="complete")[0][:, :, 1:]
-    transposed = np.swapaxes(plane, 1, 2)
-    return (
-        plane @ solve_batch(transposed @ unit @ plane, (transposed @ (vectors / root)[:, :, None])[:, :, 0])[:, :, None]
-    )[:, :, 0] / root
-
-
-def invert_batch(matrices: FloatArray) -> FloatArray:
-    """(H, K, K) inverses; NaN where a matrix is singular."""
-    unit, root = _with_unit_diagonal(matrices)
-    return _solve_each_if_singular(np.linalg.inv, np.nan, unit) / (root[:, :, None] * root[:, None, :])
-
-
-def _solve_each_if_singular(solve: Callable[..., FloatArray], fallback: float, *stacks: FloatArray) -> FloatArray:
-    """What ``solve`` makes of stacks: of all at once, or where a matrix is singular, of each; ``fallback`` for that one."""
-    try:
-        return np.asarray(solve(*stacks))
-    except np.linalg.LinAlgError:
-        if len(stacks[0]) == 1:
-            return np.full_like(stacks[-1], fallback)
-        rows = [[stack[i : i + 1] for stack in stacks] for i in range(len(stacks[0]))]
-        return np.concatenate([_solve_each_if_singular(solve, fallback, *row) for row in rows])
-
-
-def with_noise_ratios(hypothesis: FitHypothesis, ratios: FloatArray) -> list[FitHypothesis]:
-    """The same hypothesis at several ratios of the noises."""
-    return [replace(hypothesis, noise_ratio=float(ratio)) for ratio in ratios]

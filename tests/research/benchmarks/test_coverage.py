@@ -17,7 +17,7 @@ from benchmarks.random_systems import MAX_INPUT, ODE, POPULATIONS, draw, make_pr
 from estimator import SILVERBOX_TWIN, OnlineEstimator, Rig, coefficients_of, difference, duffing, recorded_prior
 from estimator.belief import Belief
 from estimator.models.difference_equation import Term
-from estimator.support.array_types import SILVERBOX_SAMPLING_STEP
+from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
 TAIL = 1e-4  # chance that a calibrated posterior misses one bound of one check
 PHYSICAL = {"m", "c", "a", "b"}

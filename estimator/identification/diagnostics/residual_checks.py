@@ -1,0 +1,57 @@
+"""Checks of the forecast errors: whether the standardised innovations are white and normal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimator.identification.data.record import Record
+from estimator.identification.diagnostics.check_finding import CheckFinding
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
+from estimator.support.array_types import FloatArray
+
+
+def standardised_innovations(y: FloatArray, forecast: FloatArray) -> FloatArray:
+    """(n,) standardised innovations of the outputs that were seen."""
+    with np.errstate(invalid="ignore"):
+        values = (y - forecast[:, 0]) / np.sqrt(forecast[:, 1])
+    return values[np.isfinite(values)]
+
+
+#: Probability of a false alarm of a test of the residuals.
+_FALSE_ALARM_PROBABILITY = 1e-4
+
+
+def check_residuals(
+    problem: IdentificationProblem, records: Sequence[Record], forecasts: Sequence[FloatArray]
+) -> list[CheckFinding]:
+    """Whether what the forecasts left is white and normal."""
+    from statistics import NormalDist
+
+    residuals_of_records = [
+        standardised_innovations(mask_unexplained_outputs(one.y, problem.rig), forecast)[4:]
+        for one, forecast in zip(records, forecasts, strict=True)
+    ]
+    values = np.concatenate(residuals_of_records)
+    n, warnings = len(values), list[CheckFinding]()
+    if n < 100:
+        return warnings
+    lags, most = 20, 52.386  # chi2.isf(_ALARM, lags): SciPy's statistics take longer to import than records to identify
+    products = [
+        sum(float(one[k:] @ one[: len(one) - k]) for one in residuals_of_records if len(one) > k)
+        for k in range(lags + 1)
+    ]
+    statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
+    if statistic > most:
+        message = (
+            "errors of the forecasts can be foreseen: the equation, the way of the input or the noise is not as assumed"
+        )
+        warnings.append(CheckFinding("residuals_not_white", message))
+    centred = (values - values.mean()) / values.std()
+    kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
+    if abs(kurtosis) > 6.0 or np.abs(centred).max() > -NormalDist().inv_cdf(_FALSE_ALARM_PROBABILITY / n / 2):
+        message = "errors of the forecasts are not normal: there are outliers, or the noise comes and goes"
+        warnings.append(CheckFinding("residuals_not_normal", message))
+    return warnings

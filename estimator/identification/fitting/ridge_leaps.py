@@ -1,0 +1,121 @@
+"""Leaps along a parameter to places of the posterior that a walk does not reach."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.identification.fitting.ridge_walk import (
+    FIT_ITERATIONS,
+    MAX_LOSS,
+    SCREENING_ITERATIONS,
+    ParameterMap,
+    finite_losses,
+)
+from estimator.identification.likelihood.fit_hypothesis import LaplaceFits
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.support.array_types import FloatArray
+
+#: Lengths of the short leaps [standard deviations].
+_LEAP_STDS = (6.0, 15.0)
+
+#: Number of leaps in the parameter's logarithm, either way.
+_N_LOG_LEAPS = 5
+
+#: Length of each in the logarithm.
+_LOG_LEAP_LENGTH = 0.5 * np.log(10.0)
+
+#: Longest leap [standard deviations].
+_MAX_LEAP_STDS = 1e9
+
+#: Factors of the noise ratio that are tried after a leap.
+_LEAP_RATIO_FACTORS = (1.0, 0.1, 0.01)
+
+#: Loss after the first steps above which a leap is dropped [nats].
+_MAX_SCREENING_LOSS = 1000.0
+
+#: Relative standard deviation below which a parameter has no leaps.
+_MIN_RELATIVE_STD = 1e-3
+
+#: Length from which a leap speaks against a Gaussian [standard deviations].
+_SURPRISING_LEAP_STDS = 4.0
+
+#: Its loss as a fraction of the Gaussian's, at most.
+_SURPRISING_LOSS_FRACTION = 0.5
+
+
+def fit_leaps(
+    fitter: LaplaceFitter, parameter_map: ParameterMap, start: LaplaceFits, parameter_indices: npt.NDArray[np.intp]
+) -> tuple[dict[int, LaplaceFits], bool]:
+    """Parameter to fits straight on from the start that are worth about as much, and whether a Gaussian has none there.
+
+    They are tried with fewer noises first, and in a few steps: most are hopeless.
+    """
+    begin, values, slopes = start.mean[0], parameter_map.values(start.mean)[0], parameter_map.slopes(start.mean)[0]
+    leaps = list[tuple[int, float, FloatArray]]()
+    for number in parameter_indices.tolist():
+        toward = start.cov[0] @ slopes[number]
+        std = float(np.sqrt(slopes[number] @ toward))
+        if not std > _MIN_RELATIVE_STD * abs(values[number]):
+            continue
+        first, unit = np.arcsinh(values[number] / std), toward / std
+        for side in (1.0, -1.0):
+            near = [values[number] + side * far * std for far in _LEAP_STDS]
+            for target in [*near, *(std * np.sinh(first + side * _LOG_LEAP_LENGTH * np.arange(1, _N_LOG_LEAPS + 1)))]:
+                length = _length_to_target(parameter_map, number, begin, side * unit, side, float(target))
+                leaps.append((number, length, begin + side * length * unit))
+    if not leaps:
+        return {}, False
+    leap_parameters, lengths, points = (np.array(part) for part in zip(*leaps, strict=True))
+    gradients = parameter_map.slopes(points)[np.arange(len(points)), leap_parameters]
+    for factors, iterations, allowed in (
+        (_LEAP_RATIO_FACTORS[1:2], SCREENING_ITERATIONS, _MAX_SCREENING_LOSS),
+        (_LEAP_RATIO_FACTORS, FIT_ITERATIONS, MAX_LOSS),
+    ):
+        n, count = len(factors), len(points)
+        ratios = start.hypotheses[0].noise_ratio * np.tile(factors, count)
+        hypotheses = [replace(start.hypotheses[0], noise_ratio=float(ratio)) for ratio in ratios]
+        begins, pinned = np.repeat(points, n, axis=0), np.repeat(gradients, n, axis=0)
+        fits = fitter.fit(hypotheses, begins, start.sensor_std[0], iterations, fixed_directions=pinned)
+        found = fits.select(np.arange(count) * n + finite_losses(fits).reshape(count, n).argmin(axis=1))
+        kept = finite_losses(found) < start.loss[0] + allowed
+        found = found.select(kept)
+        points, gradients, leap_parameters, lengths = (
+            points[kept],
+            gradients[kept],
+            leap_parameters[kept],
+            lengths[kept],
+        )
+        if not len(points):
+            return {}, False
+    promised = np.where(lengths > _SURPRISING_LEAP_STDS, 0.5 * lengths**2, 0.0)
+    is_surprising = bool((found.loss - start.loss[0] < _SURPRISING_LOSS_FRACTION * promised).any())
+    return {
+        number: found.select(leap_parameters == number) for number in np.unique(leap_parameters).tolist()
+    }, is_surprising
+
+
+def _length_to_target(
+    parameter_map: ParameterMap,
+    parameter_index: int,
+    begin: FloatArray,
+    direction_vector: FloatArray,
+    sign: float,
+    target: float,
+) -> float:
+    """How far along a direction a parameter is at a target, or as near as it comes before it jumps."""
+    first = float(parameter_map.values(begin[None])[0, parameter_index])
+
+    def is_past(length: float) -> bool:
+        value = float(parameter_map.values((begin + length * direction_vector)[None])[0, parameter_index])
+        return not 0 < sign * (value - first) < sign * (target - first)
+
+    near, far = 0.0, 1.0
+    while not is_past(far) and far < _MAX_LEAP_STDS:
+        far *= 2
+    for _ in range(50):
+        middle = (near + far) / 2
+        near, far = (near, middle) if is_past(middle) else (middle, far)
+    return near

@@ -1,0 +1,183 @@
+"""Walks along a ridge of the posterior, outward along each parameter with all others refitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.identification.likelihood.fit_hypothesis import LaplaceFits
+from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.rigs.physical_parameters import physical_jacobian, to_physical
+from estimator.support.array_types import FloatArray
+
+#: Standard deviations from the mode at which the posterior is compared with a Gaussian.
+GAUSSIAN_CHECK_STDS = 2.0
+
+#: Factor between the root of the loss there and the Gaussian's, either way, at most.
+_GAUSSIAN_CHECK_FACTOR = 1.25
+
+#: Loss at which a walk ends [nats].
+MAX_LOSS = 8.0
+
+#: Steps of a walk, at most.
+_MAX_WALK_STEPS = 30
+
+#: Factor of the parameter, either way, at which a walk ends.
+_MAX_PARAMETER_FACTOR = 100.0
+
+#: Loss below which the next step is longer [nats].
+_LOW_STEP_LOSS = 0.5
+
+#: Loss above which the next step is shorter [nats].
+_HIGH_STEP_LOSS = 1.5
+
+#: Loss above which a step is rejected and repeated [nats].
+_MAX_STEP_LOSS = 3.0
+
+#: Factor of a longer step.
+_STEP_GROWTH = 1.7
+
+#: Factor of a repeated step.
+_STEP_SHRINKAGE = 0.4
+
+#: Ratios of the noises that are tried beside that of the step before, as factors.
+_WALK_RATIO_FACTORS = (0.2, 1.0, 5.0)
+
+#: Steps of a fit in the Gaussian check and in the screening of leaps.
+SCREENING_ITERATIONS = 3
+
+#: Steps of every other fit along a ridge.
+FIT_ITERATIONS = 10
+
+#: Times that a step is halved where the parameter jumps, at most.
+_MAX_HALVINGS = 12
+
+#: Length of a step below which a walk ends [standard deviations].
+_MIN_STEP_STDS = 0.02
+
+
+class ParameterMap:
+    """From the coefficients of a fit to the parameters of the rig's model, in the rig's units."""
+
+    def __init__(self, problem: IdentificationProblem) -> None:
+        self.model, self.scales, k = problem.rig.model, problem.scales, problem.model.n_coefficients
+        none = np.zeros((k, k))
+        self._offset = problem.moments_about_zero(np.zeros(k), none)[0]
+        self._rotation = np.stack(
+            [problem.moments_about_zero(row, none)[0] - self._offset for row in np.eye(k)], axis=1
+        )
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """(n, P) parameters of coefficients (n, K)."""
+        return to_physical(self.model, points @ self._rotation.T + self._offset, self.scales)
+
+    def slopes(self, points: FloatArray) -> FloatArray:
+        """(n, P, K) of the parameters by the coefficients."""
+        return physical_jacobian(self.model, points @ self._rotation.T + self._offset, self.scales) @ self._rotation
+
+
+@dataclass
+class RidgeWalk:
+    """Walks outward along W parameters side by side.
+
+    Attributes:
+        parameter_index: (W,) the parameter of each, by number.
+        direction: (W,) 1 or -1.
+        current: what each has reached.
+        step_length: (W,) of the next step, in standard deviations there.
+    """
+
+    fitter: LaplaceFitter
+    parameter_map: ParameterMap
+    parameter_index: npt.NDArray[np.intp]
+    direction: FloatArray
+    current: LaplaceFits
+    step_length: FloatArray
+
+    def predict_step(self, walks: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Of some walks: (n, K) where the next step leads if all is Gaussian, and (n, K) the parameter's slopes."""
+        points, which, side = self.current.mean[walks], self.parameter_index[walks], self.direction[walks]
+        rows = np.arange(len(walks))
+        slopes = self.parameter_map.slopes(points)[rows, which]
+        cov_slope = np.einsum("nkl,nl->nk", self.current.cov[walks], slopes)
+        variance = np.einsum("nk,nk->n", slopes, cov_slope)
+        unit = side[:, None] * cov_slope / np.sqrt(np.maximum(variance, 1e-300))[:, None]
+        now = self.parameter_map.values(points)[rows, which]
+        for _ in range(_MAX_HALVINGS):
+            ahead = points + self.step_length[walks, None] * unit
+            # A parameter that is a quotient jumps where what it is divided by changes its sign.
+            change = side * (self.parameter_map.values(ahead)[rows, which] - now)
+            jumps = ~(change > 0)
+            if not jumps.any():
+                break
+            self.step_length[walks[jumps]] /= 2
+        return ahead, slopes
+
+    def fit_step(self, walks: npt.NDArray[np.intp], ratio_factors: Sequence[float], iterations: int) -> LaplaceFits:
+        """Of some walks the best fits where the next step leads, with the noises in the best of some ratios."""
+        ahead, slopes = self.predict_step(walks)
+        n = len(ratio_factors)
+        hypotheses = [
+            replace(self.current.hypotheses[i], noise_ratio=self.current.hypotheses[i].noise_ratio * factor)
+            for i in walks
+            for factor in ratio_factors
+        ]
+        levels = np.repeat(self.current.sensor_std[walks], n)
+        fits = self.fitter.fit(
+            hypotheses, np.repeat(ahead, n, axis=0), levels, iterations, fixed_directions=np.repeat(slopes, n, axis=0)
+        )
+        return fits.select(np.arange(len(walks)) * n + finite_losses(fits).reshape(-1, n).argmin(axis=1))
+
+    def walk_outward(self, lowest_loss: float) -> tuple[LaplaceFits, npt.NDArray[np.intp]]:
+        """Go until the records lose enough; all that was fitted on the way, and the number of the walk of each."""
+        self.step_length[:] = 1.0
+        rows = np.arange(len(self.parameter_index))
+        first = self.parameter_map.values(self.current.mean)[rows, self.parameter_index]
+        steps, walkers, active = list[LaplaceFits](), list[npt.NDArray[np.intp]](), rows
+        for _ in range(_MAX_WALK_STEPS):
+            found = self.fit_step(active, _WALK_RATIO_FACTORS, FIT_ITERATIONS)
+            loss_increase = finite_losses(found) - self.current.loss[active]
+            is_accepted = loss_increase < _MAX_STEP_LOSS
+            kept, length = active[is_accepted], self.step_length[active]
+            numbers = rows.copy()
+            numbers[kept] = len(rows) + np.flatnonzero(is_accepted)
+            self.current = LaplaceFits.concatenated([self.current, found]).select(numbers)
+            steps.append(found.select(is_accepted))
+            walkers.append(kept)
+            lowest_loss = min(lowest_loss, *self.current.loss)
+            factors = np.select(
+                [~is_accepted, loss_increase > _HIGH_STEP_LOSS, loss_increase < _LOW_STEP_LOSS],
+                [_STEP_SHRINKAGE, 1 / _STEP_GROWTH, _STEP_GROWTH],
+                1.0,
+            )
+            self.step_length[active] = length * factors
+            change = np.abs(self.parameter_map.values(self.current.mean)[rows, self.parameter_index] / first)
+            is_irrelevant = (change > _MAX_PARAMETER_FACTOR) | (change < 1 / _MAX_PARAMETER_FACTOR)
+            is_finished = (
+                (self.current.loss - lowest_loss > MAX_LOSS) | is_irrelevant | (self.step_length < _MIN_STEP_STDS)
+            )
+            active = active[~is_finished[active]]
+            if not len(active):
+                break
+        return LaplaceFits.concatenated(steps), np.concatenate(walkers)
+
+
+def finite_losses(fits: LaplaceFits) -> FloatArray:
+    """(H,) losses; inf where a fit ran away."""
+    return np.where(np.isfinite(fits.free_energy), fits.loss, np.inf)
+
+
+def is_gaussian(walk: RidgeWalk, found: LaplaceFits) -> bool:
+    """Whether what the records lose is what a Gaussian says."""
+    rows = np.arange(len(walk.parameter_index))
+    now, there = (walk.parameter_map.values(fits.mean)[rows, walk.parameter_index] for fits in (walk.current, found))
+    slopes = walk.parameter_map.slopes(walk.current.mean)[rows, walk.parameter_index]
+    std = np.sqrt(np.einsum("nk,nkl,nl->n", slopes, walk.current.cov, slopes))
+    root = np.sqrt(2 * np.maximum(found.loss - walk.current.loss, 0.0))
+    with np.errstate(all="ignore"):
+        apart = np.abs(np.log(root / (np.abs(there - now) / std)))
+    return bool((apart < np.log(_GAUSSIAN_CHECK_FACTOR)).all())

@@ -1,0 +1,142 @@
+"""Starting points of the search: weak-form starts, random starts, and fits from each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from estimator.identification.fitting.weak_form import random_starts, weak_form_starts
+from estimator.identification.likelihood.fit_hypothesis import (
+    FitHypothesis,
+    LaplaceFits,
+    with_noise_ratios,
+)
+from estimator.identification.likelihood.initial_states import find_initial_states
+from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.rigs.physical_parameters import coefficients_of
+from estimator.support.array_types import FloatArray
+
+#: Where the search for the noises begins: σ_w/σ_v in parts of the squared angular frequency, which is what moves the
+#: output as much as it disturbs it. It is open to either side.
+_INITIAL_NOISE_RATIOS = np.geomspace(1e-2, 1e2, 5)
+
+#: Periods of each record in the first fits.
+_FIRST_PERIODS = 25
+
+#: Fewest samples of each record in the first fits.
+_MIN_FIRST_SAMPLES = 1024
+
+#: Most samples of each record in the first fits.
+_MAX_FIRST_SAMPLES = 4096
+
+#: The equation is tested with so many periods, where these are more samples.
+_WEAK_FORM_PERIODS = 40
+
+#: Steps of it, after which so many of its hypotheses are kept.
+_FIRST_SEARCH_STAGES = ((3, 8), (10, 1))
+
+#: Random starts in a round.
+_N_RANDOM_STARTS = 192
+
+#: Periods in the first segments that random starts are fitted to.
+_SEGMENT_PERIODS = 4
+
+#: Samples in the first segments, at least.
+_MIN_SEGMENT_SAMPLES = 128
+
+#: Factor by which segments grow from round to round.
+_SEGMENT_GROWTH = 4
+
+#: Steps of a fit from a random start.
+_RESTART_FIT_STEPS = 8
+
+#: Results that are kept of random starts, of segments, and of all records.
+_N_KEPT_STARTS = (48, 12, 3)
+
+#: Steps of a fit to all records, from what the first look found and from where it began, of which the best is kept.
+_CONFIRMING_FIT_STEPS = 3
+
+
+def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
+    """The best of all starts and ratios of the noises; of none where all ran away."""
+    problem = fitter.problem
+    period = 2 * np.pi / problem.mean_frequency
+    samples = int(np.clip(_FIRST_PERIODS * period, _MIN_FIRST_SAMPLES, _MAX_FIRST_SAMPLES))
+    short_fitter = fitter.for_problem(problem.with_segments(problem.most_driven_segments(samples), samples))
+    samples = int(max(_WEAK_FORM_PERIODS * period, _MAX_FIRST_SAMPLES))
+    candidates = weak_form_starts(problem.with_segments(problem.most_driven_segments(samples), samples))
+    if problem.rig.guess is not None:
+        middle = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
+        middle |= {"u0": problem.rig.input.offset, "y0": problem.rig.output.offset}
+        guessed = coefficients_of(problem.model, middle, problem.scales)
+        candidates.append(problem.moments_about_origin(guessed, np.zeros((len(guessed),) * 2))[0])
+    if not candidates:
+        return fit_random_starts(fitter)
+    ratios = _INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order)
+    base = FitHypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]), lag=problem.lag)
+    sensor_std = np.array(0.1 * problem.output_rms)
+    initial_states = find_initial_states(short_fitter.problem, base, np.array(candidates), float(sensor_std))
+    moving = [replace(base, initial_states=begin) for begin in initial_states]
+    resting = [base] * len(candidates) + moving
+    points = np.repeat(np.array([*candidates, *candidates]), len(_INITIAL_NOISE_RATIOS), axis=0)
+    hypotheses = [h for one in resting for h in with_noise_ratios(one, ratios)]
+    for steps, kept in _FIRST_SEARCH_STAGES:
+        fits = short_fitter.fit(hypotheses, points, sensor_std, steps).lowest_free_energy(kept)
+        hypotheses, points, sensor_std = list(fits.hypotheses), fits.mean, fits.sensor_std
+    if short_fitter.problem.n_observed_outputs < problem.n_observed_outputs and np.isfinite(fits.free_energy).any():
+        # The first periods may tell little of a coefficient, which then is anywhere: all records judge.
+        points = np.array([*fits.mean, *candidates])
+        fits = fitter.fit(
+            list(fits.hypotheses) * len(points), points, fits.sensor_std[0], _CONFIRMING_FIT_STEPS
+        ).lowest_free_energy(1)
+    return fits if np.isfinite(fits.free_energy).any() else fit_random_starts(fitter)
+
+
+def fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
+    """The best that many starts lead to, which are drawn and fitted to pieces of the records that grow."""
+    problem = fitter.problem
+    ratios = _INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order)
+    base = FitHypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[2]), lag=problem.lag)
+    shortest = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_PERIODS * 2 * np.pi / problem.mean_frequency))
+    points = np.array(random_starts(problem, _N_RANDOM_STARTS, seed))
+    shape, levels = (_N_RANDOM_STARTS, *np.diag(points[0]).shape), np.full(_N_RANDOM_STARTS, 0.1 * problem.output_rms)
+    random_fits = LaplaceFits(
+        (base,) * _N_RANDOM_STARTS, points, np.zeros(shape), levels, *np.zeros((2, _N_RANDOM_STARTS))
+    )
+    found = []
+    for segment in dict.fromkeys(
+        [problem.largest_output_segment(shortest), *problem.most_driven_segments(shortest)[:1]]
+    ):
+        samples, (n_first, n_later, _) = shortest, _N_KEPT_STARTS
+        fits = _fit_from_initial_states(
+            fitter.for_problem(problem.with_segments([segment], samples)), random_fits, ratios[[1, 3]], n_first
+        )
+        while samples < max(map(len, problem.u)):
+            fits = _fit_from_initial_states(
+                fitter.for_problem(problem.with_segments([segment], samples)), fits, ratios, n_later
+            )
+            samples *= _SEGMENT_GROWTH
+        found.append(fits)
+    return _fit_from_initial_states(fitter, LaplaceFits.concatenated(found), ratios, _N_KEPT_STARTS[2])
+
+
+def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: FloatArray, n_kept: int) -> LaplaceFits:
+    """The best of fits from where others came to, of records that begin in motion, each at the best of the ratios."""
+    if not len(fits.mean):
+        return fits
+    base = replace(fits.hypotheses[0], initial_states=None)
+    initial_states = find_initial_states(fitter.problem, base, fits.mean, float(np.median(fits.sensor_std)))
+    hypotheses = [
+        one for begin in initial_states for one in with_noise_ratios(replace(base, initial_states=begin), ratios)
+    ]
+    points, levels = np.repeat(fits.mean, len(ratios), axis=0), np.repeat(fits.sensor_std, len(ratios))
+    tried = fitter.fit(hypotheses, points, levels, _RESTART_FIT_STEPS)
+    of_each = tried.free_energy.reshape(-1, len(ratios)).argmin(axis=1)
+    return _distinct_optima(tried.select(len(ratios) * np.arange(len(of_each)) + of_each), n_kept)
+
+
+def _distinct_optima(fits: LaplaceFits, max_count: int) -> LaplaceFits:
+    """The best of those that did not come to the same."""
+    finite = fits.select(np.isfinite(fits.free_energy))
+    return finite.select(np.unique(np.round(finite.free_energy), return_index=True)[1][:max_count])
