@@ -1,4 +1,4 @@
-"""Identification of a user's own oscillator from recorded inputs and outputs: `identify`."""
+"""System identification of a Duffing oscillator from recorded inputs and outputs: `identify`."""
 
 from __future__ import annotations
 
@@ -38,34 +38,34 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
     """Identify m, c, a and b of Eq. (1), with offsets and noises, from records.
 
     The coefficients are the most probable ones under the Kalman filter's likelihood of all records, with a Gaussian
-    about them (variational Laplace: `estimator.identification.likelihood.laplace_fit`). The two noises are unknown: hypotheses about their
-    ratio, each at its best level, are weighed by their free energies, on a grid that is refined. Without a guess in the
-    rig the search begins at the equation tested with smooth bumps (`estimator.identification.fitting.weak_form`), and where that
-    leads nowhere at coefficients that are drawn, always the same.
+    about them (variational Laplace: `estimator.identification.likelihood.laplace_fit`). The two noises are unknown:
+    a grid of their ratios, each at its best level, is weighted by the free energies and refined. Without a guess in
+    the rig the search starts from the weak form of the equation (`estimator.identification.fitting.weak_form`), and
+    where this fails, from random coefficients with a fixed seed.
 
     Args:
         rig: a `Rig`, a dictionary, or the name of a rig file.
-        records: pairs (u, y) of arrays (T,) in the rig's units, paired by index, or names of CSV or MAT files; one or a
-            list. Before its first sample a record may have been in any motion; its first outputs, three, as many as the
-            input is late, and one more of an accelerometer, are left out, because inputs before the record may still
-            act. An output that is NaN is missing; a record is cut where an input is.
-        progress: tell on stderr how far it is, where it takes more than 5 seconds.
+        records: one or a list of pairs (u, y) of arrays (T,) in the rig's units, paired by index, or of names of CSV
+            or MAT files. A record may begin in any motion. Its first outputs are left out, because inputs before the
+            record may still act: three, the delay of the input, and one more of an accelerometer. An output that is
+            NaN is missing; a record is cut where an input is NaN.
+        progress: print the progress on stderr, if it takes more than 5 seconds.
 
-    Where no input varies, or a file has none, the oscillator decays freely: c/m, a/m and b/m are then what is told.
+    Without a varying input, or without a column of inputs, the record is a free decay: it identifies c/m, a/m and b/m.
 
     Returns:
-        Parameters with intervals, warnings of the checks, forecasts, and the belief to go on with.
+        Parameters with intervals, warnings of the checks, forecasts, and the posterior belief.
 
     Raises:
         ValueError: naming the rig's key or the record (and the line of its file), the value and the remedy.
-        FileNotFoundError: for a file that is not there.
+        FileNotFoundError: for a file that does not exist.
 
     Example:
         >>> import numpy as np
         >>> from estimator import Channel, Rig, identify
         >>> rng = np.random.default_rng(0)
         >>> u = 6.0 * np.repeat(rng.choice([-1.0, 1.0], 128), 8)  # N, held by the amplifier
-        >>> y, v = np.zeros(1024), 0.0  # m: a mass of 0.4 kg on a hardening spring, by small explicit steps
+        >>> y, v = np.zeros(1024), 0.0  # m: a mass of 0.4 kg on a hardening spring, by explicit steps
         >>> for k in range(1023):
         ...     x = y[k]
         ...     for _ in range(100):
@@ -96,7 +96,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
             IdentificationProblem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), on_progress
         )
         problem = search_result.fitter.problem
-        # Forecasts, and checks that compare the equation with others, are of the most probable place of a ridge.
+        # Forecasts and comparisons of equations use the most probable point of a ridge.
         ridge_result = search_result if is_free else spread_along_ridge(search_result, TARGET_PARAMETERS)
         belief, noises = posterior_belief(problem, ridge_result)
         on_progress(0.9, "checking the result")
@@ -113,13 +113,13 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
 
 
 def _choose_scales(rig: Rig, records: list[Record]) -> Scales:
-    """The rig's, and the records' largest where the rig has none."""
+    """The scales of the rig, and the largest recorded values where the rig has none."""
     largest_input = max(float(np.abs(one.u).max()) for one in records)
     is_free = largest_input == 0.0
     largest_input = largest_input or 1.0
     largest_output = max(float(np.nanmax(np.abs(one.y))) for one in records)
     scales = rig.scales
-    if is_free:  # of these scales a mass of 1 has the gain 1
+    if is_free:  # in these scales a mass of 1 has the gain 1
         scales = replace(scales, output=scales.output if rig.output.range else largest_output)
         return replace(scales, input=scales.displacement / rig.step**2)
     return replace(
@@ -130,7 +130,7 @@ def _choose_scales(rig: Rig, records: list[Record]) -> Scales:
 
 
 def _output_origin(rig: Rig, outputs: Sequence[FloatArray]) -> float:
-    """Where to count outputs from: their mean, of a displacement that is farther from 0 than it moves; else 0."""
+    """The origin of the outputs: the mean of a displacement whose mean exceeds its standard deviation; else 0."""
     observed = np.concatenate(outputs)
     mean = float(np.nanmean(observed))
     return mean if DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind] == 0 and abs(mean) > np.nanstd(observed) else 0.0

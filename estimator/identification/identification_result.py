@@ -1,4 +1,4 @@
-"""`Result`: what records tell of an oscillator, in the units of its rig."""
+"""`Result`: identified parameters with intervals, warnings, forecasts and noises, in the units of the rig."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from estimator.support.array_types import FloatArray
 
 _Value = TypeVar("_Value")
 
-#: What a free decay tells: its name, the parameter that it is where m is 1, and powers of displacement and second.
+#: Ratio that a free decay identifies, to the parameter that equals it at m = 1 and its powers of the input's unit, the
+#: displacement's unit and the second.
 FREE_DECAY_RATIOS = {
     "c/m": ("c", (0, 0, -1)),
     "a/m": ("a", (0, 0, -2)),
@@ -34,26 +35,26 @@ FREE_DECAY_RATIOS = {
 
 
 def parameter_moments(belief: Belief, ridges: RidgePosterior | None) -> dict[str, tuple[float, float]]:
-    """Parameter to mean and standard deviation of a belief, with the spreads along ridges where there are any."""
+    """Parameter to mean and standard deviation of a belief, with half widths along ridges where there are any."""
     ridge_stds = {} if ridges is None else ridges.half_widths()
     return {name: (mean, ridge_stds.get(name, std)) for name, (mean, std, _) in belief.parameters().items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What `identify` found.
+    """The result of `identify`.
 
     Attributes:
-        rig: as it was given.
-        belief: the posterior, before a further record: its coefficients and noises, with the state at any place.
-        warnings: what the checks found; empty where nothing speaks against the result.
-        records: the records, with clipped samples taken out.
-        forecasts: per record, (T, 2) mean and variance of each output before it was seen.
-        noises: name to mean and standard deviation: of ``input``, the disturbance of the force as a standard deviation
-            per sample, and of ``output``, the sensor's.
-        compute_history: makes `history`, which takes some fits.
-        compute_forecasts: makes forecasts in which the filter is shown so many outputs of each record alone.
-        ridges: along which the posterior lies where it is no Gaussian; intervals are then taken along them.
+        rig: the rig of the records.
+        belief: the posterior of coefficients and noises, with an unknown state, as before a further record.
+        warnings: findings of the checks; empty where no check speaks against the result.
+        records: the records, without clipped samples.
+        forecasts: per record, (T, 2) mean and variance of each output, one sample ahead.
+        noises: ``input`` and ``output`` to mean and standard deviation of the noise's own standard deviation per
+            sample: the disturbance of the force, and the sensor's noise.
+        compute_history: computes `history`, by several fits.
+        compute_forecasts: computes forecasts from the first n outputs of each record alone.
+        ridges: ridges of a posterior that is no Gaussian, from which the intervals are then taken; None of a Gaussian.
     """
 
     rig: Rig
@@ -80,12 +81,14 @@ class Result:
         return not any(one.u.any() for one in self.records)
 
     def _of_identifiable(self, values: dict[str, _Value]) -> dict[str, _Value]:
-        """What the records tell of what is given for all parameters."""
-        return {name: values[own] for name, (own, _) in FREE_DECAY_RATIOS.items()} if self.is_free_decay else values
+        """The values of all parameters, or after a free decay of the ratios that it identifies."""
+        if not self.is_free_decay:
+            return values
+        return {name: values[parameter] for name, (parameter, _) in FREE_DECAY_RATIOS.items()}
 
     @property
     def unidentified(self) -> tuple[str, ...]:
-        """Parameters that the records do not identify: the check ``not_identified`` names them."""
+        """Parameters that the check ``not_identified`` names."""
         return tuple(name for one in self.warnings if one.name == "not_identified" for name in one.parameters)
 
     @property
@@ -96,35 +99,45 @@ class Result:
         return {name: unit for name, (_, _, unit) in self.belief.parameters().items()}
 
     def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Parameter to the central interval that holds it with a probability.
+        """Parameter to its central credible interval.
+
+        Args:
+            probability: of the interval.
 
         Raises:
-            ValueError: for a probability that is not between 0 and 1.
+            ValueError: for a probability outside of 0 to 1.
         """
         gaussian = self.belief.interval(probability)
         return self._of_identifiable(gaussian if self.ridges is None else gaussian | self.ridges.interval(probability))
 
     @cached_property
     def history(self) -> ContractionHistory:
-        """What the first samples left: how many outputs, and the mean and standard deviation of each parameter.
+        """Number of outputs, and mean and standard deviation of each parameter that the first outputs leave.
 
-        From few samples to all, for the same oscillator in the same noise (`estimator.identification.fitting.posterior_belief`).
+        From few samples to all, for the same oscillator and noise
+        (`estimator.identification.fitting.posterior_belief.contraction_history`).
         """
         return self.compute_history()
 
     @property
     def estimator(self) -> OnlineEstimator:
-        """A new estimator that begins with what is believed now, for further records.
+        """A new online estimator with this posterior as its prior, for further records.
 
         Raises:
-            ValueError: after a free decay, which does not tell m.
+            ValueError: after a free decay, which does not identify m.
         """
         if self.is_free_decay:
-            raise ValueError("records must have an input for an estimator to go on, but are of a free decay; drive it")
+            raise ValueError(
+                "records must have an input for an estimator, but are of a free decay; add a driven record"
+            )
         return OnlineEstimator(self.belief.model, self.belief, self.rig)
 
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
-        """Free run of the mean parameters over inputs (T,) in the rig's units, started by the first outputs.
+        """Free run at the mean parameters.
+
+        Args:
+            u: (T,) inputs in the rig's unit.
+            y_init: the first outputs, which start the run.
 
         Raises:
             ValueError: as `OnlineEstimator.simulate`.
@@ -132,11 +145,11 @@ class Result:
         return self.estimator.simulate(u, y_init)
 
     def report(self, path: str | Path, commands: Sequence[str] = ()) -> Path:
-        """Write one page of HTML that opens without a network: parameters, fits, residuals, and the checks.
+        """Write one HTML page, readable offline, with parameters, fits, residuals and checks.
 
         Args:
-            path: of the page; its folder is made.
-            commands: that made it, to be shown.
+            path: the page; its folder is created.
+            commands: the commands that made it, which the page shows.
         """
         content = ReportContent(
             self.rig,
@@ -161,5 +174,5 @@ class Result:
             for (name, (mean, _)), (low, high) in zip(self.parameters.items(), intervals.values(), strict=True)
             for digits in [digits_to_distinguish(low, high, 6)]
         ]
-        warnings = [f"WARNING {warning}" for warning in self.warnings] or ["no check speaks against it"]
+        warnings = [f"WARNING {warning}" for warning in self.warnings] or ["no check speaks against this result"]
         return "\n".join([*rows, *warnings])

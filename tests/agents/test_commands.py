@@ -148,7 +148,7 @@ def test_warnings_are_told(run, folder, monkeypatch):
         (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
         (
             ["rig", "init", "new.toml", "--from", "kind.csv"],
-            "unit of 'displacement [m/s]' must be of a kind with the name, displacement, but tells velocity",
+            "the unit of 'displacement [m/s]' must fit its name, a displacement, but is the unit of a velocity",
         ),
         (["rig", "init", "new.toml", "--step", "1"], "step goes with a record"),
         (["rig", "init", "new.toml", "--from", "plain.csv", "--step", "-1"], "step must be a number from 1e-30"),

@@ -33,8 +33,8 @@ def test_a_gross_outlier_stands_first():
     y[700], y[3] = 1e3, -80.0
     first = identify(rig_of(BENCH), (u, y)).warnings[0]
     assert first.name == "outliers"
-    assert "2 outputs stand alone, far off all others: sample 700 of record 0 is 1e+03 m" in first.message
-    assert "and 99 % are within 0.0" in first.message
+    assert "2 outputs are outliers: sample 700 of record 0 is 1e+03 m" in first.message
+    assert "and 99 % of the outputs are within 0.0" in first.message
 
 
 def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
@@ -45,7 +45,7 @@ def test_a_blow_that_rings_out_in_a_long_silence_is_no_outlier():
     assert _check_outliers(Channel("m"), [struck]) == []
     struck.y[50] = 30.0
     (found,) = _check_outliers(Channel("m"), [struck])
-    assert found.message.startswith("1 output stands alone, far off all others: sample 50 of struck is 30 m")
+    assert found.message.startswith("1 output is an outlier: sample 50 of struck is 30 m")
     assert _check_outliers(Channel("m/s²", kind="acceleration"), [struck]) == []
 
 
@@ -179,7 +179,7 @@ def test_blows_that_few_samples_see_are_named(rate, named):
     _, rig, record = struck((0.1, 0.9), rate, "displacement", 4e-3)
     messages = [one.message for one in identify(rig, record).warnings if one.name == "short_blows"]
     assert bool(messages) is named
-    assert all("that 3 samples see" in message for message in messages)
+    assert all("impacts of 3 samples" in message for message in messages)
 
 
 def test_short_steps_that_a_converter_held_are_no_blows():

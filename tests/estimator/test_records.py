@@ -60,7 +60,7 @@ def test_files(tmp_path):
     whole = bytearray((tmp_path / "r.mat").read_bytes())
     whole[176] ^= 1  # an unknown kind of number, of which SciPy's reader dies
     (tmp_path / "r.mat").write_bytes(whole)
-    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file, but is not: the reader died"):
+    with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file, but is not: the reader crashed"):
         read_records(tmp_path / "r.mat", Rig(0.01))
     (tmp_path / "r.mat").write_bytes(b"none")
     with pytest.raises(ValueError, match=r"r\.mat must be a sound MAT file"):
@@ -148,7 +148,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
             "t,u,y\n" + "".join(f"{k / 2},{k % 3},{k}\n" for k in range(60)),
             "times are 0.5 s apart, but the step is 0.01 s",
         ),
-        ("t,u,y\n0,1,2\n0.01,1,3\n0.01,2,3\n", "line 4: times must grow, but 0.01 s comes after 0.01 s"),
+        ("t,u,y\n0,1,2\n0.01,1,3\n0.01,2,3\n", "line 4: times must increase, but 0.01 s comes after 0.01 s"),
         ("t,u,y\n0,1,2\n,1,3\n0.02,2,3\n", "line 3: there must be a time beside the input, but there is none"),
         ("t,u,y\n0,,2\n0.01,,3\n", "must have two samples in a row with time and input, but has none"),
         ("t [days],u,y\n0,1,2\n1,1,3\n", "the unit of the times must be one of s, ms, us,"),
@@ -262,7 +262,7 @@ def copies(u, y):
 def test_samples_that_come_twice_are_refused(how):
     given, later, at, earlier, begin = copies(*simulated(SOFT, samples=400))[how]
     message = (
-        f"{later} must have samples of its own, but from its sample {at} on has those of {earlier} from sample {begin}"
+        f"{later} must have samples of its own, but its samples from {at} on are those of {earlier} from sample {begin}"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
         read_records(given, Rig(0.01))

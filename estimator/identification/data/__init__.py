@@ -1,1 +1,1 @@
-"""Records read: text tables, MAT files, sampling times, sensor faults."""
+"""Reading of recorded data: text tables, MAT files, sampling times, sensor faults."""

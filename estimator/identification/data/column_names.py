@@ -1,21 +1,25 @@
-"""Columns of a table: which are time, input and output, and in what unit, by their names."""
+"""Names of columns: find time, input and output of a table, and their units, by the names."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from estimator.rigs.units import conversion_factor, normalise_unit
 
-#: Names of columns, in lower case, up to the first character that is not a letter.
+#: First words of the names of input columns, in lower case.
 _INPUT_WORDS = ("u", "input", "force", "f", "in", "drive", "excitation")
-#: Kind of an output to the words that name it.
+
+#: Kind of an output to the first words of its columns.
 WORDS_OF_SENSOR_KIND = {
     "displacement": ("displacement", "disp", "position", "pos"),
     "velocity": ("velocity", "vel", "v"),
     "acceleration": ("acceleration", "acc", "a"),
 }
+
+#: First words of the names of output columns.
 _OUTPUT_WORDS = (
     "y",
     "output",
@@ -24,9 +28,11 @@ _OUTPUT_WORDS = (
     "x",
     *(word for words in WORDS_OF_SENSOR_KIND.values() for word in words),
 )
+
+#: First words of the names of time columns.
 _TIME_WORDS = ("t", "time", "timestamp", "datetime", "zeit", "seconds", "sec", "msec")
 
-#: What a time column may be in [s].
+#: Unit of time to seconds.
 SECONDS_OF_TIME_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 SECONDS_OF_TIME_UNIT |= {
     "sec": 1.0,
@@ -38,13 +44,16 @@ SECONDS_OF_TIME_UNIT |= {
     "milliseconds": 1e-3,
 }
 
-#: Units that a name may end with, without brackets: ``force_N``, ``x/mm``.
+#: Prefixes of SI units, as a regular expression.
 _SI_PREFIX = "[kmMµμun]?"
+
+#: Units that a name may end with, without brackets: ``force_N``, ``x/mm``.
 _BARE_UNIT_PATTERN = re.compile(
-    rf"{_SI_PREFIX}(N|V|A|Pa|g|m)|lbf?|in|ft|cm|dm|{_SI_PREFIX}m/s(\^?2|²|/s)?|mps2?|{_SI_PREFIX}V/V|{_SI_PREFIX}N[ ·*]?m|rad|deg|°"
+    rf"{_SI_PREFIX}(N|V|A|Pa|g|m)|lbf?|in|ft|cm|dm|{_SI_PREFIX}m/s(\^?2|²|/s)?|mps2?"
+    rf"|{_SI_PREFIX}V/V|{_SI_PREFIX}N[ ·*]?m|rad|deg|°"
 )
 
-#: What stands in place of a unit where there is none.
+#: Words for no unit.
 _NO_UNIT = ("", "-")
 
 
@@ -55,12 +64,12 @@ def first_word(name: str) -> str:
 
 
 def is_input_or_output(name: str) -> bool:
-    """Whether a column is called as an input or an output is."""
+    """Whether the name of a column is usual for an input or an output."""
     return first_word(name) in (*_INPUT_WORDS, *_OUTPUT_WORDS)
 
 
 def unit_in_name(name: str) -> str | None:
-    """The unit that the name of a column holds; None where it holds none.
+    """The unit in the name of a column; None without one.
 
     Example:
         >>> [unit_in_name(name) for name in ("force [N]", "Time/ms", "v_mm/s", "Time in ms", "t {s}", "CH1", "x_rel")]
@@ -68,16 +77,16 @@ def unit_in_name(name: str) -> str | None:
     """
     if found := re.search(r"(?:\[\s*([^\]]+?)\s*\]|\(\s*([^)]+?)\s*\)|\{\s*([^}]+?)\s*\}|<\s*([^>]+?)\s*>)\s*$", name):
         return next(group for group in found.groups() if group)
-    # Of v_m/s the unit is m/s, and not s.
+    # The unit of v_m/s is m/s, not s.
     patterns = [r"\s+in\s+(\S+)\s*$", r"[^\W_](?:_+|\s+)(\S+/\S+)\s*$", r"\w\s*/\s*(\S.*?)\s*$"]
-    if first_word(name) in (*_TIME_WORDS, *_INPUT_WORDS, *_OUTPUT_WORDS):  # and not Channel A
+    if first_word(name) in (*_TIME_WORDS, *_INPUT_WORDS, *_OUTPUT_WORDS):  # the A of Channel A is no unit
         patterns.append(r"[^\W_](?:_+|\s+)(\S+)\s*$")
     found = next((one for one in (re.search(p, name) for p in patterns) if one and is_unit(one.group(1))), None)
     return found.group(1) if found else None
 
 
 def name_without_unit(name: str) -> str:
-    """The name of a column without the unit behind it.
+    """The name of a column without its unit.
 
     Example:
         >>> [name_without_unit(name) for name in ("force [N]", "Time/ms", "CH1")]
@@ -90,7 +99,7 @@ def name_without_unit(name: str) -> str:
 
 
 def name_with_unit(name: str, unit: str) -> str:
-    """The name of a column of numbers in a unit: as it is, unless it says another one.
+    """The name of a column whose numbers have a unit: unchanged, unless the name holds another unit.
 
     Example:
         >>> name_with_unit("Weg [mm]", "mm"), name_with_unit("Weg [mm]", "m"), name_with_unit("Weg", "m")
@@ -105,7 +114,7 @@ def name_with_unit(name: str, unit: str) -> str:
 
 
 def is_unit(word: str) -> bool:
-    """Whether a word, which may stand in brackets, is a unit, or stands for none."""
+    """Whether a word, with or without brackets, is a unit or a word for no unit."""
     inner = re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", word.strip())
     known = (
         inner.lower() in (*_NO_UNIT, "none")
@@ -116,10 +125,14 @@ def is_unit(word: str) -> bool:
 
 
 def seconds_per_time_unit(path: Path, name: str) -> float:
-    """Seconds in the unit of a column of times.
+    """Seconds per unit of a time column.
+
+    Args:
+        path: the file, for messages.
+        name: name of the column.
 
     Raises:
-        ValueError: where the name holds more than the time, and no unit that is known.
+        ValueError: for a name with an unknown unit.
     """
     unit, whole = unit_in_name(name), name.strip().lower()
     if unit is None and first_word(name) in SECONDS_OF_TIME_UNIT and whole not in _TIME_WORDS[:1]:
@@ -130,18 +143,24 @@ def seconds_per_time_unit(path: Path, name: str) -> float:
             return 1.0
         unit = rest
     if unit not in SECONDS_OF_TIME_UNIT:
+        units = ", ".join(list(SECONDS_OF_TIME_UNIT)[:8])
         raise ValueError(
-            f"{path}: the unit of the times must be one of {', '.join(list(SECONDS_OF_TIME_UNIT)[:8])}, but {name!r:.60} says "
-            f"{unit!r:.40}; rename the column, such as 'time [ms]'"
+            f"{path}: the unit of the times must be one of {units}, but {name!r:.60} has {unit!r:.40}; rename the "
+            f"column, such as 'time [ms]'"
         )
     return SECONDS_OF_TIME_UNIT[unit]
 
 
 def append_unit(path: Path, name: str, unit: str) -> str:
-    """The name of a column with the unit that stands below it, with or without brackets.
+    """The name of a column with the unit from the line below.
+
+    Args:
+        path: the file, for messages.
+        name: name of the column.
+        unit: the unit, with or without brackets.
 
     Raises:
-        ValueError: where the name has another.
+        ValueError: where the name has another unit.
     """
     current_unit, unit_below = unit_in_name(name), re.sub(r"^[\[({<]\s*(.*?)\s*[\])}>]$", r"\1", unit.strip())
     if (
@@ -153,6 +172,20 @@ def append_unit(path: Path, name: str, unit: str) -> str:
     return name if current_unit or unit_below.lower() in (*_NO_UNIT, "none") else f"{name} [{unit_below}]"
 
 
+class ColumnIndices(NamedTuple):
+    """Indices of the columns of a table.
+
+    Attributes:
+        time: column of the times; None without one.
+        input: column of the inputs; None in a free decay.
+        output: column of the outputs.
+    """
+
+    time: int | None
+    input: int | None
+    output: int
+
+
 def locate_columns(
     path: Path,
     names: Sequence[str],
@@ -160,31 +193,31 @@ def locate_columns(
     input_name: str | None,
     output_name: str | None,
     timestamp_columns: Collection[int] = (),
-) -> tuple[int | None, int | None, int]:
-    """Places of time (or None), input (None in a free decay) and output.
+) -> ColumnIndices:
+    """Find the columns of time, input and output.
 
-    Columns whose names say nothing are the input and the output in this order, where there are no others.
+    Where no usual name decides, the remaining columns are input and output, in this order.
 
     Args:
-        path: of the file.
-        names: of its columns; empty where it names none.
-        count: of its columns.
-        input_name: name of the input's column; one of the usual names where it is None.
-        output_name: of the output's, likewise.
+        path: the file, for messages.
+        names: names of its columns; empty where it has none.
+        count: number of its columns.
+        input_name: name of the input's column; None: one of the usual names.
+        output_name: name of the output's column; None: one of the usual names.
         timestamp_columns: columns of dates or times of day.
 
     Raises:
-        ValueError: where no column has them, or several have.
+        ValueError: where a column is missing, or several are possible.
     """
     if not names:
         if input_name or output_name:
             raise ValueError(
-                f"{path} must name its columns, because the rig does, but has numbers alone; add them as a "
-                f"first line, or leave column out of the rig"
+                f"{path} must name its columns, because the rig names them, but has numbers alone; add the names as a "
+                f"first line, or remove column from the rig"
             )
         if count not in (2, 3):
             raise ValueError(f"{path} must have two columns, u and y, or three with the time, but has {count}")
-        return (None, 0, 1) if count == 2 else (0, 1, 2)
+        return ColumnIndices(None, 0, 1) if count == 2 else ColumnIndices(0, 1, 2)
     requested = [
         _locate_named_column(path, names, wish, table)
         for wish, table in ((input_name, "input"), (output_name, "output"))
@@ -208,21 +241,21 @@ def locate_columns(
     if len(rest) == (not u) + (not y):  # in the usual order
         u, y = u or rest[:1], y or rest[-1:]
     if not u and len(y) == 1 and len(time) == 1 and not rest:
-        return time[0], None, y[0]
+        return ColumnIndices(time[0], None, y[0])
     if len(u) != 1 or len(y) != 1 or len(time) > 1:
         raise ValueError(
-            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename: "
-            f"an input is called {_join_words(_INPUT_WORDS)}, an output {_join_words(_OUTPUT_WORDS)}; or name them, as column = '...' in "
-            f"the rig's [input] and [output], or by --input and --output of duffing-env rig init"
+            f"{path} must have one column of inputs and one of outputs, such as 'u,y', but has {list(names)}; rename "
+            f"the input to {_join_words(_INPUT_WORDS)}, and the output to {_join_words(_OUTPUT_WORDS)}; or name them, "
+            f"as column = '...' in the rig's [input] and [output], or by --input and --output of duffing-env rig init"
         )
-    return (time[0] if time else None), u[0], y[0]
+    return ColumnIndices(time[0] if time else None, u[0], y[0])
 
 
 def _locate_named_column(path: Path, names: Sequence[str], requested: str | None, table: str) -> list[int]:
-    """The place of the column that a rig names, in a list; an empty one where it names none."""
+    """The index of the column that a rig names, in a list; an empty list where it names none."""
     if requested is None:
         return []
-    # The name as it stands there, or without its unit; or else the file has the same in another unit than the rig.
+    # The name in the file, with or without its unit; else the same name with another unit.
     requested_name = requested.strip().lower()
     found = [
         k for k, name in enumerate(names) if requested_name in (name.strip().lower(), name_without_unit(name).lower())
@@ -232,8 +265,8 @@ def _locate_named_column(path: Path, names: Sequence[str], requested: str | None
     ]
     if len(found) != 1:
         raise ValueError(
-            f"{path} must have one column {requested!r:.60}, which the rig's [{table}] names, but has {list(names)}; mend "
-            f"one of them"
+            f"{path} must have one column {requested!r:.60}, which the rig's [{table}] names, but has {list(names)}; "
+            f"mend one of them"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Whether two records share samples, which would count twice."""
+"""Duplicate samples: whether two records share samples, which would count twice."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from estimator.support.array_types import FloatArray
 
 _Hashes = npt.NDArray[np.uint64]
 
-#: So many outputs in a row, with their inputs, are the same by chance only where the noise is far below the last digit.
+#: Length of the compared rows [samples]: equal rows are no coincidence unless the noise is far below the last digit.
 _ROW_LENGTH = 50
 
-#: Where two records lie over each other, a copy has at least this part of their samples. Of an experiment that was
-#: repeated, a coarse converter gives a stretch twice now and then.
+#: Fraction of the overlap of two records that a copy has in common, at least. Records of a repeated experiment may
+#: share a stretch through a coarse converter.
 _MIN_SHARED_FRACTION = 0.5
 
 #: Odd numbers that mix the bits of a sample.
@@ -24,7 +24,14 @@ _HASH_MULTIPLIERS = tuple(np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1
 
 
 class SharedSamples(NamedTuple):
-    """Samples that a later part has in common with an earlier one, by number, and where they begin in both."""
+    """Samples that two records share.
+
+    Attributes:
+        earlier: number of the earlier record.
+        begin_earlier: first shared sample in the earlier record.
+        later: number of the later record.
+        begin_later: first shared sample in the later record.
+    """
 
     earlier: int
     begin_earlier: int
@@ -33,15 +40,15 @@ class SharedSamples(NamedTuple):
 
 
 def find_shared_samples(records: Sequence[tuple[FloatArray, FloatArray]]) -> SharedSamples | None:
-    """The first samples that two parts share, or None.
+    """The first samples that two records share, or None.
 
-    Two parts share samples where, laid over each other at some place, half of the outputs that both have, and 50 at
-    least, are the same in rows of 50, with their inputs, bit by bit. Outputs that are NaN are passed over. A row that
-    comes again within a part is no sign: a periodic motion without noise, or a rest between two of a converter's
-    levels, repeats itself. It takes O(T log T).
+    Two records share samples if, at some shift, half of the outputs that both have, and at least 50, agree bit by bit
+    with their inputs, in rows of 50. Outputs that are NaN are skipped. A row that occurs twice within a record does not
+    count: a periodic motion without noise, or a rest between two levels of a converter, repeats itself. The search
+    takes O(T log T).
 
     Args:
-        records: (T,) inputs and (T,) outputs of each; inputs are finite.
+        records: (T,) inputs and (T,) outputs of each record; the inputs are finite.
     """
     observed = [np.flatnonzero(np.isfinite(y)) for _, y in records]
     hashes, owners, places = [], [], []
@@ -58,7 +65,7 @@ def find_shared_samples(records: Sequence[tuple[FloatArray, FloatArray]]) -> Sha
     repeated = np.flatnonzero(value[1:] == value[:-1])
     if len(repeated) == 0:
         return None
-    # A row that two parts have says where one would lie over the other.
+    # A row that two records have in common gives a shift between them.
     alignments = np.stack([owner[repeated], owner[repeated + 1], place[repeated + 1] - place[repeated]], axis=1)
     distinct_alignments, which, count = np.unique(alignments, axis=0, return_inverse=True, return_counts=True)
     for alignment in np.lexsort((distinct_alignments[:, 0], distinct_alignments[:, 1])):
@@ -71,7 +78,7 @@ def find_shared_samples(records: Sequence[tuple[FloatArray, FloatArray]]) -> Sha
 
 
 def _hash_samples(u: FloatArray, y: FloatArray) -> _Hashes:
-    """(T,) a number for each pair of an input and an output; -0.0 is 0.0."""
+    """(T,) hash of each pair of an input and an output; -0.0 counts as 0.0."""
     first, second, third = _HASH_MULTIPLIERS
     mixed = (u + 0.0).view(np.uint64) * first + (y + 0.0).view(np.uint64) * second
     mixed = (mixed ^ (mixed >> np.uint64(31))) * third
@@ -79,7 +86,7 @@ def _hash_samples(u: FloatArray, y: FloatArray) -> _Hashes:
 
 
 def _hash_rows(samples: _Hashes) -> _Hashes:
-    """(T - 49,) a number for each row of 50: the sum of samples times powers of an odd number, modulo 2**64."""
+    """(T - 49,) hash of each row of 50: the sum of samples times powers of an odd number, modulo 2**64."""
     if len(samples) < _ROW_LENGTH:
         return np.zeros(0, dtype=np.uint64)
     base = int(_HASH_MULTIPLIERS[0])

@@ -1,4 +1,4 @@
-"""Inputs and outputs from MATLAB files, read in a process of their own."""
+"""Records from MATLAB files, read in a separate process."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from estimator.rigs.rig import Rig
 from estimator.support.argument_checks import to_finite_series
 from estimator.support.optional_dependencies import require_packages
 
-#: A file of that size is read in less [s]; a damaged one might be read for ever.
+#: Longest time to read a file [s]: a damaged file may never end.
 _MAT_TIMEOUT = 300.0
 
-#: Reads a MAT file in a process of its own: SciPy's reader is ended by a segmentation fault at some damaged ones.
+#: Program that reads a MAT file in a separate process, because SciPy's reader crashes at some damaged files.
 _MAT_READER = """
 import io, sys
 import numpy
@@ -39,11 +39,17 @@ sys.stdout.buffer.write(buffer.getvalue())
 
 
 def read_mat_records(path: Path, rig: Rig) -> list[Record]:
+    """The records of a MAT file: one, or one for each column of its variables.
+
+    Raises:
+        ValueError: naming the file and the fault.
+        ModuleNotFoundError: for a file of version 7.3 without h5py.
+    """
     names = (rig.input.column or "u", rig.output.column or "y")
     with path.open("rb") as file:
         if file.read(10) == b"MATLAB 7.3":
             require_packages("h5py")
-    # With -P no file beside the record, such as a numpy.py, is taken for a module.
+    # With -P the program imports no file beside the record, such as a numpy.py.
     command = [sys.executable, "-P", "-W", "ignore", "-c", _MAT_READER, str(path), *names]
     try:
         done = subprocess.run(command, capture_output=True, timeout=_MAT_TIMEOUT)
@@ -52,8 +58,8 @@ def read_mat_records(path: Path, rig: Rig) -> list[Record]:
             f"{path} must be a MAT file that can be read within {_MAT_TIMEOUT:g} s, but was not; save u and y anew"
         ) from error
     if done.returncode != 0:
-        told = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader died of it"]
-        raise ValueError(f"{path} must be a sound MAT file, but is not: {told[-1]:.200}")
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["the reader crashed"]
+        raise ValueError(f"{path} must be a sound MAT file, but is not: {lines[-1]:.200}")
     try:
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
             held = {name: arrays[name] for name in arrays.files}

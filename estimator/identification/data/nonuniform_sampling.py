@@ -1,8 +1,8 @@
-"""When inputs act and outputs are seen: a record as samples that each have a length of their own.
+"""Resampling of records with uneven times, fractional delays or a lag: samples of individual length.
 
-Between two of its knots, which are the times of outputs and of changes of the input, the input is a polynomial, and the
-filter takes one sample. So times may be uneven, a delay may be a part of a step, and a record may have another step
-than the rig. Times are counted in the rig's steps, from the first output on.
+The knots of a record are the times of its outputs and of the changes of its input. Between two knots the input is a
+polynomial, and the filter takes one sample. Therefore times may be uneven, a delay may be a fraction of a step, and a
+record may have another step than the rig. Times are counted in the rig's steps, from the first output on.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ import numpy.typing as npt
 from estimator.rigs.rig import INTERPOLATION_DEGREES
 from estimator.support.array_types import FloatArray
 
-#: A sample is no longer than this [steps]: the steps of integration are chosen for one of length 1.
+#: Longest sample [steps]: the substeps of the integration are chosen for a length of 1.
 _MAX_SPAN = 1.5
 
-#: Knots that are nearer than this are one [steps].
+#: Distance below which two knots are one [steps].
 _KNOT_TOLERANCE = 1e-6
 
-#: Places in [0, 1] through which the polynomial of a lagging input goes, and what makes coefficients of the values.
+#: Nodes in [0, 1] of the polynomial that interpolates a lagged input.
 _CHEBYSHEV_NODES = (1 - np.cos(np.pi * np.arange(6) / 5)) / 2
+
+#: Matrix from values at the nodes to coefficients of the polynomial.
 _NODE_VALUES_TO_COEFFICIENTS = np.linalg.inv(np.vander(_CHEBYSHEV_NODES, increasing=True))
 
 
@@ -31,10 +33,10 @@ class NonuniformSamples(NamedTuple):
     """A record on its knots.
 
     Attributes:
-        inputs: (N, rows) coefficients of the input's polynomial over each sample, in parts of the sample.
-        outputs: (N,) at the end of each sample; NaN where none was seen.
+        inputs: (N, rows) coefficients of the input's polynomial over each sample, whose length counts as 1.
+        outputs: (N,) outputs at the end of each sample; NaN where there is none.
         spans: (N,) lengths [steps].
-        output_indices: (T,) the sample that ends with each output.
+        output_indices: (T,) index of the sample that ends with each output.
     """
 
     inputs: FloatArray
@@ -46,11 +48,11 @@ class NonuniformSamples(NamedTuple):
 def resample_on_knots(
     times: FloatArray, u: FloatArray, y: FloatArray, interpolation: str, delay: float = 0.0, lag: float = 0.0
 ) -> NonuniformSamples:
-    """Lay a record on its knots. It begins a step before its first output.
+    """Resample a record on its knots, from one step before its first output.
 
     Args:
-        times: (T,) of inputs and outputs [steps], which grow from 0 on.
-        u: (T,) inputs. Before the first there is none; after the last it stays.
+        times: (T,) times of inputs and outputs [steps], increasing from 0.
+        u: (T,) inputs. Before the first the input is 0; after the last it stays.
         y: (T,) outputs; NaN where one is missing.
         interpolation: of the input: ``zero_order``, ``linear`` or ``spline``.
         delay: of the input [steps].
@@ -62,7 +64,7 @@ def resample_on_knots(
     )
     knots = _split_long_gaps(knots[np.diff(knots, prepend=-np.inf) > _KNOT_TOLERANCE])
     sample_starts, spans = knots[:-1], np.diff(knots)
-    # Knots that fell together keep the first of them.
+    # Of several knots that count as one, the first remains.
     output_indices = np.minimum(np.searchsorted(knots, times - 2 * _KNOT_TOLERANCE), len(knots) - 1) - 1
     inputs = _input_polynomials(input_times, u, sample_starts, spans, interpolation)
     outputs = np.full(len(spans), np.nan)
@@ -71,7 +73,7 @@ def resample_on_knots(
 
 
 def _split_long_gaps(knots: FloatArray) -> FloatArray:
-    """With more knots where two are far apart."""
+    """The knots, with more of them where two are farther apart than the longest sample."""
     n_parts = np.maximum(1, np.ceil(np.diff(knots) / _MAX_SPAN - _KNOT_TOLERANCE)).astype(np.intp)
     which = np.repeat(np.arange(len(n_parts)), n_parts)
     within = np.arange(len(which)) - np.repeat(np.cumsum(n_parts) - n_parts, n_parts)
@@ -81,7 +83,7 @@ def _split_long_gaps(knots: FloatArray) -> FloatArray:
 def _input_polynomials(
     input_times: FloatArray, u: FloatArray, sample_starts: FloatArray, spans: FloatArray, interpolation: str
 ) -> FloatArray:
-    """(N, degree + 1) polynomials of the input over samples that no change of it interrupts."""
+    """(N, degree + 1) polynomials of the input over samples within which it does not change its piece."""
     if interpolation == "spline":
         from scipy.interpolate import make_interp_spline
 
@@ -101,12 +103,12 @@ def _input_polynomials(
 
 
 def _linear_input(input_times: FloatArray, u: FloatArray, times: FloatArray) -> FloatArray:
-    """The input that goes linearly from one to the next, from 0 a step before the first."""
+    """The linearly interpolated input, from 0 one step before the first."""
     return np.interp(times, np.append(input_times[0] - 1.0, input_times), np.append(0.0, u))
 
 
 def _lagged_polynomials(inputs: FloatArray, spans: FloatArray, lag: float) -> FloatArray:
-    """(N, 6) polynomials of v, where lag v' = u - v, of held or linear u; v begins at u."""
+    """(N, 6) polynomials of the lagged input v, where lag v' = u - v with a held or linear u; v starts at u."""
     first = inputs[:, 0]
     slope = (inputs[:, 1] if inputs.shape[1] > 1 else np.zeros(len(inputs))) * lag / spans
     # v = u(s) - slope + (v_0 - u_0 + slope) exp(-s span/lag)

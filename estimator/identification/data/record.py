@@ -12,21 +12,20 @@ from estimator.support.array_types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One record.
+    """The inputs and outputs of one measurement.
 
     Attributes:
-        name: of its file, or its number; of a later piece with the sample where it begins.
+        name: name of the file, or number of the record; a later piece adds the sample at which it begins.
         u: (T,) inputs.
-        y: (T,) outputs; NaN where one is missing or was clipped.
-        n_clipped: outputs that were clipped, or over range.
-        n_missing: outputs that were not there.
-        n_stale: outputs that stood still while the oscillator moved, in bursts or because each was repeated, and were
-            taken out.
-        n_bursts: of these.
-        samples_per_value: samples for which each output stood; 1 where none was repeated.
-        times: (T,) of the samples [s], where these are not the rig's step apart.
-        step: between most samples [s], as its own times say; None where it has none.
-        is_over_range: (T,) whether an output was over range, in a record that is whole.
+        y: (T,) outputs; NaN where one is missing or clipped.
+        n_clipped: number of clipped or over-range outputs.
+        n_missing: number of missing outputs.
+        n_stale: number of removed outputs that stand still while the oscillator moves, in bursts or by repetition.
+        n_bursts: number of such bursts.
+        samples_per_value: samples for which a sensor repeats each output; 1 without repetition.
+        times: (T,) times of the samples [s]; None where they are the rig's step apart.
+        step: usual step of its own times [s]; None without times.
+        is_over_range: (T,) whether an output is over range, before the record is cut.
     """
 
     name: str
@@ -42,7 +41,7 @@ class Record:
     is_over_range: npt.NDArray[np.bool_] | None = field(default=None, repr=False)
 
     def times_in_steps(self, step: float) -> FloatArray:
-        """(T,) times in sampling steps, from the first sample on."""
+        """(T,) times of the samples, in sampling steps of ``step`` seconds, from the first sample on."""
         if self.times is None:
             return np.arange(len(self.u), dtype=np.float64)
         return np.asarray((self.times - self.times[0]) / step)

@@ -1,4 +1,4 @@
-"""Cleaning of recorded signals: gaps, lost lines, clipped and over-range outputs."""
+"""Cleaning of recorded signals: gaps, lost lines, and clipped, stale or over-range outputs."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ _MIN_CLIPPING_RATIO = 4
 MIN_PIECE_OUTPUTS = 8
 
 
-def observed_values(values: FloatArray) -> FloatArray:
-    return values[np.isfinite(values)]
-
-
 def split_at_missing_inputs(record: Record) -> list[Record]:
-    """Pieces between missing inputs, without what has no output, and with what is clipped taken out."""
+    """The pieces of a record between missing inputs, up to their last outputs, with bad outputs as missing.
+
+    Bad outputs are clipped, over range or stale. Pieces of fewer than `MIN_PIECE_OUTPUTS` outputs are dropped.
+    """
     is_clipped = find_clipped_outputs(record.y)
     is_over_range = np.zeros(len(record.y), dtype=np.bool_) if record.is_over_range is None else record.is_over_range
-    missing = np.isnan(record.y) & ~is_over_range
+    is_missing = np.isnan(record.y) & ~is_over_range
     is_clipped = is_clipped | is_over_range
     y = np.where(is_clipped, np.nan, record.y)
     stale_outputs = find_stale_outputs(y)
@@ -43,7 +42,7 @@ def split_at_missing_inputs(record: Record) -> list[Record]:
             continue
         part = slice(piece.start, piece.start + seen[-1] + 1)
         times = None if record.times is None else record.times[part].copy()
-        counts = int(is_clipped[part].sum()), int(missing[part].sum())
+
         name = f"{record.name}, from sample {piece.start}" if piece.start else record.name
         pieces.append(
             replace(
@@ -51,8 +50,8 @@ def split_at_missing_inputs(record: Record) -> list[Record]:
                 name=name,
                 u=record.u[part].copy(),
                 y=y[part].copy(),
-                n_clipped=counts[0],
-                n_missing=counts[1],
+                n_clipped=int(is_clipped[part].sum()),
+                n_missing=int(is_missing[part].sum()),
                 times=times,
                 is_over_range=None,
                 n_stale=int(stale_outputs.is_stale[part].sum()),
@@ -64,20 +63,20 @@ def split_at_missing_inputs(record: Record) -> list[Record]:
 
 
 def _true_runs(flags: npt.NDArray[np.bool_]) -> Iterator[slice]:
-    """Where flags are set, one after another."""
+    """The runs of set flags, in order."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     for begin, end in edges.reshape(-1, 2):
         yield slice(int(begin), int(end))
 
 
 def find_clipped_outputs(y: FloatArray) -> npt.NDArray[np.bool_]:
-    """(T,) whether an output stands at a stop: the largest or smallest value, which several outputs have exactly.
+    """(T,) whether an output is clipped: at the largest or smallest value, which the signal reaches again and again.
 
-    Few samples in a period leave one in a row there. A converter's coarse levels are no stop: the next level is met
-    almost as often. Nor is a start at rest: the signal comes to a stop again.
+    A fast motion may have one sample at the stop per visit. Two signals are not clipped: one on the coarse levels of a
+    converter, which has the next level almost as often, and one that starts at rest, which visits its level once.
     """
     found = np.zeros(len(y), dtype=np.bool_)
-    levels = np.sort(observed_values(y))
+    levels = np.sort(y[np.isfinite(y)])
     levels = levels[np.diff(levels, prepend=-np.inf) > 0]
     if len(levels) < 10:
         return found
@@ -93,7 +92,15 @@ def find_clipped_outputs(y: FloatArray) -> npt.NDArray[np.bool_]:
 def mask_over_range(
     name: str, u: FloatArray, y: FloatArray, times: FloatArray | None = None, step: float = 0.0
 ) -> Record:
-    """A record of a file, without what is over range, and with the lines that its times say were lost."""
+    """The record of a file, with infinite values as missing, and with a missing line for each lost one.
+
+    Args:
+        name: name of the record.
+        u: (T,) inputs.
+        y: (T,) outputs; an infinite one is over range.
+        times: (T,) times of the samples [s], which show lost lines; None where they are even.
+        step: sampling step of the rig [s].
+    """
     is_over_range = np.isinf(y)
     u, y = np.where(np.isfinite(u), u, np.nan), np.where(np.isfinite(y), y, np.nan)
     if times is not None:
@@ -104,7 +111,7 @@ def mask_over_range(
 def _insert_lost_lines(
     u: FloatArray, y: FloatArray, is_over_range: npt.NDArray[np.bool_], times: FloatArray, step: float
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], FloatArray | None]:
-    """With a missing line wherever even times leap by whole steps; times are None where they are then even."""
+    """Add a missing line for each whole step by which even times jump; the times are None if they are even then."""
     steps = np.diff(times)
     usual = np.nanmedian(steps)
     steps_per_line = np.round(steps / usual)
@@ -116,12 +123,9 @@ def _insert_lost_lines(
     ):
         return u, y, is_over_range, times
     places = np.concatenate([[0], np.cumsum(np.maximum(steps_per_line, 1)).astype(np.intp)])
-    wide = lambda values, fill: np.full(places[-1] + 1, fill, dtype=values.dtype)  # noqa: E731
-    filled = []
-    for values, fill in ((u, np.nan), (y, np.nan), (is_over_range, False)):
-        one = wide(values, fill)
-        one[places] = values
-        filled.append(one)
+    count = int(places[-1]) + 1
+    new_u, new_y, new_flags = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
+    new_u[places], new_y[places], new_flags[places] = u, y, is_over_range
     even = abs(float(np.mean(steps[steps_per_line <= 1])) / step - 1) < 0.01
-    grid = times[0] + usual * np.arange(places[-1] + 1)
-    return filled[0], filled[1], filled[2], None if even else grid
+    grid = times[0] + usual * np.arange(count)
+    return new_u, new_y, new_flags, None if even else grid

@@ -1,4 +1,4 @@
-"""Records from CSV and MAT files."""
+"""Records from text tables and MAT files."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ from estimator.identification.data.text_tables import read_table
 from estimator.rigs.rig import Rig
 from estimator.support.file_io import check_readable_file
 
-#: No file of a record is larger [bytes].
+#: Largest file of a record [bytes].
 _MAX_FILE_BYTES = 2**30
 
 
 def read_record_file(path: str | Path, rig: Rig) -> list[Record]:
-    """The records of a text or MAT file, whole: gaps are NaN, and so is what is over the range of the instrument.
+    """The whole records of a text or MAT file, with NaN for missing values.
 
-    A text file is as `estimator.identification.data.text_tables.read_table` says; where its times are not the rig's step apart,
-    the record has them. A MAT file, of version 7.3 too, holds the variables ``u`` and ``y``, or those that the rig
-    names as columns: (T,), or (T, n) for n records.
+    `estimator.identification.data.text_tables.read_table` describes the text file; where its times are not the rig's
+    step apart, the record has them. A MAT file, also of version 7.3, holds the variables ``u`` and ``y``, or those that
+    the rig names as columns: (T,), or (T, n) for n records.
+
+    Args:
+        path: the file.
+        rig: the rig, with names of columns, units and sampling step.
 
     Raises:
-        ValueError: naming the file, the line and what is wrong.
-        FileNotFoundError: if there is no such file.
+        ValueError: naming the file, the line and the fault.
+        FileNotFoundError: for a file that does not exist.
         ModuleNotFoundError: for a MAT file of version 7.3 without h5py.
     """
     file = check_readable_file(path, "record must be a text or MAT file, such as CSV", _MAX_FILE_BYTES)

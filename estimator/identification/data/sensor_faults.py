@@ -1,4 +1,4 @@
-"""What a sensor or a converter did to outputs: bursts that stand still, values that are repeated, a high-pass."""
+"""Faults of sensors and converters: bursts of stale outputs, repeated values, and a high-pass."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MIN_STALE_SAMPLES = 4
 #: The jump that ends a burst, in usual changes of the output, at least.
 _MIN_JUMP_FACTOR = 4.0
 
-#: Bursts that are no chance.
+#: Bursts from which they are no coincidence.
 _MIN_BURSTS = 3
 
 #: Fraction of all changes that lie on every n-th sample, where a sensor repeats each value n times.
@@ -26,12 +26,12 @@ _MAX_REPEATS = 64
 
 
 class StaleOutputs(NamedTuple):
-    """Outputs that are no measurements.
+    """Outputs that are no measurements of their own.
 
     Attributes:
-        is_stale: (T,) which.
-        n_bursts: in which outputs stand still while the oscillator moves.
-        samples_per_value: samples for which every output stands; 1 where none is repeated.
+        is_stale: (T,) whether an output is stale.
+        n_bursts: number of bursts of stale outputs.
+        samples_per_value: samples for which the sensor repeats each value; 1 without repetition.
     """
 
     is_stale: npt.NDArray[np.bool_]
@@ -40,10 +40,13 @@ class StaleOutputs(NamedTuple):
 
 
 def find_stale_outputs(y: FloatArray) -> StaleOutputs:
-    """Outputs (T,) that a sensor only held, or gave as zero.
+    """Find outputs that a sensor only held, or gave as zero.
 
-    Of a value that is held the first sample is taken for measured. Coarse levels of a converter are no bursts: where
-    the signal turns it stands on one of them, but leaves it by a small step.
+    The first sample of a held value counts as measured. The coarse levels of a converter are no bursts: at a turn of
+    the motion the output stays on one level, but leaves it by a small step.
+
+    Args:
+        y: (T,) outputs; NaN where one is missing.
     """
     no_flags = np.zeros(len(y), dtype=np.bool_)
     observed = np.flatnonzero(np.isfinite(y))
@@ -72,7 +75,7 @@ def find_stale_outputs(y: FloatArray) -> StaleOutputs:
         after = abs(values[end] - values[begin]) if end < len(values) else 0.0
         before = abs(values[begin] - values[begin - 1]) if begin else 0.0
         same = levels[float(values[begin])] > 1
-        # A value that comes again in other bursts is a sensor's word for nothing; else the first one was measured.
+        # A value that other bursts repeat is the sensor's code for no signal; else the first sample was measured.
         if max(after, before if same else 0.0) > _MIN_JUMP_FACTOR * usual_change:
             flags[observed[begin if same else begin + 1 : end]] = True
             bursts += 1
@@ -80,24 +83,26 @@ def find_stale_outputs(y: FloatArray) -> StaleOutputs:
 
 
 def _samples_per_value(changes: npt.NDArray[np.intp]) -> int:
-    """Samples for which each value stands, where values change at every n-th sample alone; 1 otherwise."""
+    """Samples for which each value is repeated, where values change at every n-th sample alone; else 1."""
     if len(changes) < 20:
         return 1
     steps = np.diff(changes)
     n = int(np.gcd.reduce(steps[steps > 0][:200]))
-    if n < 2:  # a few changes beside the grid, as where two frames follow each other too fast
+    if n < 2:  # a few changes are off the grid, such as after two frames in quick succession
         n = int(np.median(steps))
     if not 2 <= n <= _MAX_REPEATS:
         return 1
     counts = np.bincount(changes % n, minlength=n)
-    # A held input's outputs change at every sample: here nearly none does in between.
+    # The outputs under a held input change at every sample; repeated outputs hardly ever between the grid points.
     return n if counts.max() > _MIN_REGULAR_FRACTION * len(changes) and np.median(steps) == n else 1
 
 
 def undo_high_pass(y: FloatArray, corner_frequency: float) -> FloatArray:
-    """Outputs (T,) before a first-order high-pass with a corner at an angular frequency [rad per sample].
+    """Undo a first-order high-pass by integrating its equation, z' = y' - corner z, for y.
 
-    Its equation, shown' = y' - corner shown, is integrated. Missing outputs stay missing, and count as 0.
+    Args:
+        y: (T,) outputs z of the high-pass; missing ones stay missing, and count as 0.
+        corner_frequency: angular corner frequency [rad per sample].
     """
     filled = np.nan_to_num(y)
     total = corner_frequency * (np.cumsum(filled) - 0.5 * filled)

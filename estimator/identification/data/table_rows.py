@@ -1,4 +1,4 @@
-"""Rows of a text table: separator, headings, numbers and time stamps."""
+"""Rows of a text table: separator, headings, numbers, dates and times of day."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,25 +19,28 @@ from estimator.identification.data.text_fields import (
 )
 from estimator.support.array_types import FloatArray
 
-#: Lines that show where the numbers begin.
+#: A number, or the whole seconds and their fraction of a timestamp.
+TableValue: TypeAlias = float | tuple[int, float]
+
+#: Lines of numbers in a row that mark the beginning of the numbers.
 _N_FIRST_ROWS = 3
 
 
 def guess_separator(lines: Sequence[str]) -> str | None:
-    """What stands between the fields, of the last lines, which hold numbers; None for blanks."""
+    """The separator of the fields, by the last lines, which hold numbers; None for blanks."""
     last = "".join(lines[-2:])
     return next((mark for mark in "\t;," if mark in last), None)
 
 
 def split_fields(lines: Sequence[str], separator: str | None) -> list[list[str]]:
-    """The fields of each line; empty ones at the end of all lines are left out."""
+    """The fields of each line."""
     if separator is None:
         return [line.split() for line in lines]
     return list(csv.reader(lines, delimiter=separator))
 
 
 def _is_number_row(words: Sequence[str], separator: str | None) -> bool:
-    """Whether a line holds numbers, and nothing else that is not missing."""
+    """Whether a line holds numbers, missing numbers and timestamps alone, and at least one number."""
     values = [parse_number(word, separator) for word in words]
     return any(value is not None and math.isfinite(value) for value in values) and all(
         value is not None or parse_timestamp(word) for word, value in zip(words, values, strict=True)
@@ -45,7 +48,7 @@ def _is_number_row(words: Sequence[str], separator: str | None) -> bool:
 
 
 def find_first_row(fields: Sequence[Sequence[str]], separator: str | None) -> int | None:
-    """Where the numbers begin: the first of some lines in a row that hold numbers, in as many columns."""
+    """Index of the first of several lines in a row that hold the same number of numbers; None without numbers."""
     for k, words in enumerate(fields):
         following = [one for one in fields[k : k + 2 * _N_FIRST_ROWS] if any(word.strip() for word in one)][
             :_N_FIRST_ROWS
@@ -53,17 +56,24 @@ def find_first_row(fields: Sequence[Sequence[str]], separator: str | None) -> in
         alike = all(len(one) == len(words) and _is_number_row(one, separator) for one in following)
         if len(following) > 1 and _is_number_row(words, separator) and alike:
             return k
-    # A file of few lines, or with a bad one among the first.
+    # A file with few lines, or with a faulty line among the first.
     return next((k for k, words in enumerate(fields) if _is_number_row(words, separator)), None)
 
 
 def read_headings(
     path: Path, fields: Sequence[list[str]], line_numbers: Sequence[int], width: int, separator: str | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units above the numbers, in ``width`` columns; empty where there are none.
+    """Names and units above the numbers; empty where the file has none.
+
+    Args:
+        path: the file, for messages.
+        fields: fields of the lines above the numbers.
+        line_numbers: their line numbers.
+        width: number of columns.
+        separator: of the fields.
 
     Raises:
-        ValueError: for a line above the numbers that is neither.
+        ValueError: for a faulty line above the numbers.
     """
     headings = list[tuple[list[str], int]]()
     for words, line in zip(reversed(fields), reversed(line_numbers[: len(fields)]), strict=True):
@@ -93,13 +103,19 @@ def read_headings(
 
 def parse_rows(
     path: Path, fields: Sequence[list[str]], line_numbers: Sequence[int], separator: str | None
-) -> list[list[Any]]:
-    """Numbers, or stamps, of each line.
+) -> list[list[TableValue]]:
+    """The numbers and timestamps of each line.
+
+    Args:
+        path: the file, for messages.
+        fields: fields of the lines.
+        line_numbers: their line numbers.
+        separator: of the fields.
 
     Raises:
-        ValueError: naming the line, for a field that is neither, or another number of them.
+        ValueError: naming the line, for a field that is neither, or for another number of fields.
     """
-    width, decimal_mark, rows = len(fields[0]), "", list[list[Any]]()
+    width, decimal_mark, rows = len(fields[0]), "", list[list[TableValue]]()
     for line, words in zip(line_numbers, fields, strict=True):
         if not any(word.strip() for word in words):
             rows.append([math.nan] * width)
@@ -108,32 +124,39 @@ def parse_rows(
             words = words[:width]
         if len(words) != width:
             raise ValueError(f"{path}, line {line}: must have {width} columns, but has {len(words)}; mend the line")
-        row = [
-            value if (value := parse_number(word, separator)) is not None else parse_timestamp(word) for word in words
-        ]
-        if None in row:
-            bad = words[row.index(None)]
-            raise ValueError(f"{path}, line {line}: {bad!r:.40} must be a number; {_number_remedy(bad)}")
+        row = list[TableValue]()
+        for word in words:
+            number = parse_number(word, separator)
+            value = parse_timestamp(word) if number is None else number
+            if value is None:
+                raise ValueError(f"{path}, line {line}: {word!r:.40} must be a number; {_number_remedy(word)}")
+            row.append(value)
         for word, field in zip(words, row, strict=True) if separator in DECIMAL_COMMA_SEPARATORS else ():
             if isinstance(field, tuple):
                 continue
             decimal_mark = decimal_mark or next((one for one in ",." if one in word), "")
             if decimal_mark and {",": ".", ".": ","}[decimal_mark] in word:
                 raise ValueError(
-                    f"{path}, line {line}: {word!r:.40} must have the decimal mark {decimal_mark!r} alone, as before; leave "
-                    f"out marks of thousands"
+                    f"{path}, line {line}: {word!r:.40} must have the decimal mark {decimal_mark!r} alone, as before; "
+                    f"leave out marks of thousands"
                 )
         rows.append(row)
     return rows
 
 
 def timestamps_to_seconds(
-    path: Path, rows: Sequence[Sequence[Any]], line_numbers: Sequence[int], names: Sequence[str]
+    path: Path, rows: Sequence[Sequence[TableValue]], line_numbers: Sequence[int], names: Sequence[str]
 ) -> tuple[FloatArray, frozenset[int]]:
-    """(C, T) columns, stamps as seconds from the first on, and which columns hold stamps.
+    """Columns (C, T) with timestamps as seconds from the first on, and the set of timestamp columns.
+
+    Args:
+        path: the file, for messages.
+        rows: numbers and timestamps of each line.
+        line_numbers: line numbers of the rows.
+        names: names of the columns; empty where the file has none.
 
     Raises:
-        ValueError: for a column in which some fields are stamps and some numbers.
+        ValueError: for a column that mixes timestamps and numbers.
     """
     first = rows[0]
     if not any(isinstance(value, tuple) for row in rows[:1] for value in row):
@@ -145,6 +168,8 @@ def timestamps_to_seconds(
     columns = np.empty((len(first), len(rows)))
     for k in range(len(first)):
         before = days = 0
+        start = first[k]
+        start_whole, start_rest = start if isinstance(start, tuple) else (0, 0.0)
         for t, row in enumerate(rows):
             value = row[k]
             if k not in timestamp_columns or not isinstance(value, tuple):
@@ -157,15 +182,15 @@ def timestamps_to_seconds(
                 columns[k, t] = value
                 continue
             whole, rest = value
-            if whole < 86400 and before - whole > 43200:  # past midnight, without a date
+            if whole < 86400 and before - whole > 43200:  # past midnight, in times of day without a date
                 days += 86400
             before = whole
-            columns[k, t] = (whole + days - first[k][0]) + (rest - first[k][1])
+            columns[k, t] = (whole + days - start_whole) + (rest - start_rest)
     return columns, timestamp_columns
 
 
 def parse_regular_rows(lines: Sequence[str], separator: str | None, width: int) -> list[list[float]] | None:
-    """The numbers of lines that hold nothing but finite ones, in many times less time; None of other lines."""
+    """The numbers of lines that hold finite numbers alone, many times faster than `parse_rows`; None of other lines."""
     if separator in DECIMAL_COMMA_SEPARATORS and any("," in line for line in lines):
         if any("." in line for line in lines):
             return None
@@ -178,7 +203,7 @@ def parse_regular_rows(lines: Sequence[str], separator: str | None, width: int) 
 
 
 def _number_remedy(word: str) -> str:
-    """What to do about a field that is no number."""
+    """The remedy for a field that is no number."""
     if {",", "."} <= set(word):
         return "leave out marks of thousands"
     if re.fullmatch(r"\s*[-+]?\d+,\d+\s*", word):

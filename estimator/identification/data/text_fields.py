@@ -1,4 +1,4 @@
-"""Fields of a text file: what is a number, a missing or an over-range one, a date or a time of day."""
+"""Fields of a text file: numbers, missing and over-range values, dates and times of day."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import re
 from datetime import date
 from pathlib import Path
 
-#: What stands for a missing number, in lower case.
+#: Words for a missing number, in lower case.
 _MISSING_WORDS = ("", "na", "n/a", "#n/a", "null", "none", "-", "nan")
 
-#: What stands for a number beyond the range of an instrument, in lower case and without its sign.
+#: Words for a number beyond the range of an instrument, in lower case and without a sign.
 _OVER_RANGE_WORDS = ("∞", "inf", "infinity", "1.#inf", "over", "overrange", "overload", "ol")
 
 #: Separators in files whose numbers may have a decimal comma.
@@ -22,18 +22,22 @@ _TIMESTAMP_PATTERN = re.compile(rf"\s*(?:{_DATE_PATTERN}[T ]\s*)?{_CLOCK_PATTERN
 
 
 def parse_number(word: str, separator: str | None = None) -> float | None:
-    """The number that a field holds; NaN where it is missing, ±inf where it is over range, None where it is none.
+    """The number in a field; NaN for a missing one, ±inf for an over-range one, None for another text.
+
+    Args:
+        word: the field.
+        separator: separator of the fields, beside some of which a comma is a decimal mark.
 
     Example:
-        >>> parse_number("0,5", ";"), parse_number("-∞"), parse_number(" n/a "), parse_number("12:30:01"), parse_number("1_000")
-        (0.5, -inf, nan, None, None)
+        >>> parse_number("0,5", ";"), parse_number("-∞"), parse_number(" n/a "), parse_number("12:30:01")
+        (0.5, -inf, nan, None)
     """
     bare = word.strip().lower()
     if bare in _MISSING_WORDS:
         return math.nan
     if bare.lstrip("+-") in _OVER_RANGE_WORDS:
         return -math.inf if bare.startswith("-") else math.inf
-    if "_" in bare:  # a mark of thousands in Python alone
+    if "_" in bare:  # separates thousands in Python alone
         return None
     if separator in DECIMAL_COMMA_SEPARATORS:
         bare = bare.replace(",", ".")
@@ -45,9 +49,9 @@ def parse_number(word: str, separator: str | None = None) -> float | None:
 
 
 def parse_timestamp(word: str) -> tuple[int, float] | None:
-    """Whole seconds and the rest of a date with a time of day, or of a time of day; None of other words.
+    """Whole seconds and their fraction of a date with a time of day, or of a time of day; None of another text.
 
-    A double of the seconds since some year 1 would tell microseconds only.
+    One float64 of the seconds since year 1 would resolve microseconds only.
 
     Example:
         >>> first, second = parse_timestamp("2026-05-01T23:59:59.75Z"), parse_timestamp("02.05.2026 00:00:00,25")
@@ -69,10 +73,10 @@ def parse_timestamp(word: str) -> tuple[int, float] | None:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file in UTF-8, UTF-16 or Windows' cp1252, as instruments and spreadsheets write them.
+    """The text of a file in UTF-8, UTF-16 or Windows cp1252, the encodings of instruments and spreadsheets.
 
     Raises:
-        ValueError: for what is no text.
+        ValueError: for a file that is no text.
     """
     content = path.read_bytes()
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):

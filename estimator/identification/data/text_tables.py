@@ -1,4 +1,4 @@
-"""Text files of instruments: columns of time, input and output, found by the names above the numbers."""
+"""Text tables of instruments, such as CSV files: columns of time, input and output, found by their names."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from estimator.identification.data.column_names import (
     unit_in_name,
 )
 from estimator.identification.data.table_rows import (
+    TableValue,
     find_first_row,
     guess_separator,
     parse_regular_rows,
@@ -32,7 +33,7 @@ from estimator.rigs.channel import Channel
 from estimator.rigs.units import conversion_factor, sensor_kind_of_unit
 from estimator.support.array_types import FloatArray
 
-#: Times may be off an even grid by this part of a step, or by their last digit, and are even all the same.
+#: Deviation of even times from their grid, at most [steps]; their last digit is allowed besides.
 _EVENNESS_TOLERANCE = 0.005
 
 #: Steps of a table count as alike within this fraction of the usual step.
@@ -41,22 +42,22 @@ REGULAR_STEP_TOLERANCE = 0.05
 #: Fraction of steps that are alike, from which a jump of whole steps means lost lines.
 MIN_REGULAR_FRACTION = 0.8
 
-#: A step is no longer than this many usual ones; what is longer is a gap.
+#: Longest step that is no gap, in usual steps.
 _MAX_STEP_FACTOR = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A CSV file.
+    """The content of a text table.
 
     Attributes:
-        path: of the file.
-        names: of its columns, as they stand there; empty where it has numbers alone.
+        path: the file.
+        names: names of the columns, as the file has them; empty where it has numbers alone.
         columns: (C, T) numbers; NaN where one is missing.
-        lines: (T,) of the file.
-        time_column: which column is the time; None where there is none.
-        input_column: which column is the input; None in a free decay.
-        output_column: which column is the output.
+        lines: (T,) line numbers in the file.
+        time_column: index of the time's column; None without one.
+        input_column: index of the input's column; None in a free decay.
+        output_column: index of the output's column.
         has_timestamps: whether the times were dates or times of day, and are seconds from the first on.
     """
 
@@ -71,7 +72,7 @@ class TextTable:
 
     @property
     def inputs(self) -> FloatArray:
-        """(T,) inputs; 0 where there is no column of them."""
+        """(T,) inputs; 0 without a column of inputs."""
         return (
             np.zeros(self.columns.shape[1])
             if self.input_column is None
@@ -79,12 +80,12 @@ class TextTable:
         )
 
     def step(self) -> float | None:
-        """Usual sampling step [s], of the time column; None where there is none.
+        """Usual sampling step of the time column [s]; None without one.
 
-        Times are those of the lines that have an input, and may leap where an input is missing: there a record is cut.
+        Lines with an input count. Their times may jump where an input is missing, because a record is cut there.
 
         Raises:
-            ValueError: for times that are missing or do not grow, or in a unit that is unknown.
+            ValueError: for times that are missing, do not increase, or have an unknown unit.
         """
         if self.time_column is None:
             return None
@@ -95,9 +96,9 @@ class TextTable:
         return float(steps[alike if alike.mean() > MIN_REGULAR_FRACTION else steps < _MAX_STEP_FACTOR * usual].mean())
 
     def times(self, step: float) -> FloatArray | None:
-        """(T,) times [s] of the lines, where these are not ``step`` apart; None where they are, or there are none.
+        """(T,) times of the lines [s]; None without a time column, or where the times are ``step`` seconds apart.
 
-        Times are even where they are on a grid of that step up to their last digit. Lines without an input have none.
+        Even times are on a grid of that step up to their last digit. Lines without an input do not count.
 
         Raises:
             ValueError: as `step`.
@@ -117,7 +118,7 @@ class TextTable:
         return None
 
     def _times_and_pairs(self) -> tuple[FloatArray, npt.NDArray[np.intp]]:
-        """(T,) times [s], and the lines that have an input as the line before them has."""
+        """(T,) times [s], and the indices of the lines that have an input, as has the line before."""
         assert self.time_column is not None
         unit = (
             seconds_per_time_unit(self.path, self.names[self.time_column])
@@ -127,8 +128,8 @@ class TextTable:
         time, driven = self.columns[self.time_column] * unit, np.isfinite(self.inputs)
         for k in np.flatnonzero(driven & np.isnan(time))[:1]:
             raise ValueError(
-                f"{self._location(k)}: there must be a time beside the input, but there is none; fill it in, or remove "
-                f"the column of times"
+                f"{self._location(k)}: the input must have a time, but has none; fill it in, or remove the column of "
+                f"times"
             )
         later = np.flatnonzero(driven[1:] & driven[:-1]) + 1
         if not len(later):
@@ -137,13 +138,13 @@ class TextTable:
             )
         for k in later[time[later] <= time[later - 1]][:1]:
             raise ValueError(
-                f"{self._location(k)}: times must grow, but {time[k]:.9g} s comes after {time[k - 1]:.9g} s; mend the "
-                f"line, or set records apart by an empty row"
+                f"{self._location(k)}: times must increase, but {time[k]:.9g} s comes after {time[k - 1]:.9g} s; mend "
+                f"the line, or separate the records by an empty row"
             )
         return time, later
 
     def _time_resolution(self, time: FloatArray) -> float:
-        """What the last digit of the times is worth [s]: the largest power of ten of which all are multiples."""
+        """Resolution of the times [s]: the largest power of ten of which all are multiples."""
         seen = time[np.isfinite(time)]
         seen = seen - seen[0]
         for digits in range(-2, 13):
@@ -154,42 +155,42 @@ class TextTable:
         return 0.0
 
     def _location(self, row: np.int64) -> str:
-        """The file, and the line of a row."""
+        """The file and the line of a row, for messages."""
         return f"{self.path}, line {self.lines[row]}"
 
     def unit(self, column: int) -> str | None:
-        """What stands in brackets behind the name of a column, as N in ``force [N]``; None where nothing does."""
+        """The unit in the name of a column, such as N in ``force [N]``; None without one."""
         return unit_in_name(self.names[column]) if self.names else None
 
     def has_known_name(self, column: int) -> bool:
-        """Whether the name of a column says what it is; also where there are no names."""
+        """Whether the name of a column is usual for an input or output; True where the table has no names."""
         return not self.names or is_input_or_output(self.names[column])
 
     def output_kind(self) -> str | None:
-        """What the name of the output, or else its unit, says that it is: a displacement, for one; or None.
+        """The kind of the output by its name, or else by its unit; None where neither decides.
 
         Raises:
-            ValueError: where name and unit say different things.
+            ValueError: where name and unit contradict each other.
         """
         word, unit = (
             first_word(self.names[self.output_column]) if self.names else "",
             self.unit(self.output_column) or "",
         )
         named = next((kind for kind, words in WORDS_OF_SENSOR_KIND.items() if word in words), None)
-        told = sensor_kind_of_unit(unit)
-        if named and told and named != told:
+        measured = sensor_kind_of_unit(unit)
+        if named and measured and named != measured:
             raise ValueError(
-                f"{self.path}: unit of {self.names[self.output_column]!r:.60} must be of a kind with the name, {named}, but tells "
-                f"{told}; mend one of them"
+                f"{self.path}: the unit of {self.names[self.output_column]!r:.60} must fit its name, a {named}, but is "
+                f"the unit of a {measured}; mend one of them"
             )
-        return named or told
+        return named or measured
 
     def signals_in_rig_units(self, input_channel: Channel, output_channel: Channel) -> tuple[FloatArray, FloatArray]:
-        """(T,) inputs and outputs in the units of the channels of a rig: a column in mm is scaled where the rig has m.
+        """(T,) inputs and outputs in the units of the rig's channels; a column in mm is converted if the rig has m.
 
         Raises:
-            ValueError: naming the column, for the unit of another quantity, or another kind of output. A pure number,
-                1, contradicts nothing.
+            ValueError: naming the column, for a unit of another quantity, or another kind of output. A channel that is
+                a pure number, 1, takes any unit.
         """
         word = first_word(self.names[self.output_column]) if self.names else ""
         kind = next(
@@ -197,15 +198,15 @@ class TextTable:
         )
         if kind != output_channel.kind:
             raise ValueError(
-                f"{self.path}: {self.names[self.output_column]!r:.60} must be the rig's kind of output, {output_channel.kind}, but is called "
-                f"{kind}; mend one of them"
+                f"{self.path}: {self.names[self.output_column]!r:.60} must be the rig's kind of output, "
+                f"{output_channel.kind}, but is called {kind}; mend one of them"
             )
         return self.inputs * self._unit_factor(self.input_column, input_channel), self.columns[
             self.output_column
         ] * self._unit_factor(self.output_column, output_channel)
 
     def _unit_factor(self, column: int | None, channel: Channel) -> float:
-        """From the unit of a column to that of its channel; 1 where one of them says none."""
+        """Factor from the unit of a column to the unit of its channel; 1 where one of them has none."""
         unit = None if column is None else self.unit(column)
         if not unit or channel.unit == "1":
             return 1.0
@@ -219,46 +220,41 @@ class TextTable:
 
 
 def read_table(path: Path, input_name: str | None = None, output_name: str | None = None) -> TextTable:
-    """Read a text file as instruments write it, such as CSV or LabVIEW's .lvm.
+    """Read a text file of an instrument, such as CSV or LabVIEW's .lvm.
 
-    Fields stand between commas, or semicolons or tabs (then 0,5 is a number, in a file without points), or blanks.
-    Empty ones are missing, and NaN, NA, N/A, null, none or - in them; ∞ and inf are over range. Lines that begin with #
-    are passed over; one of separators alone sets records apart. The line above the numbers may hold names, such as
-    ``u,y``, ``time [ms],force [N],x [mm]`` or ``time_ms,force_N,x_mm``; or names stand above a line of units, such as
-    ``ms,N,mm``. Lines before these are passed over. Of numbers alone there are the columns u and y, or time in seconds,
-    u and y. A column in a unit of time, or of dates or times of day, is the time, whatever its name.
+    Commas, semicolons, tabs or blanks separate the fields. With semicolons or tabs, in a file without points, 0,5 is
+    a number. Empty fields, NaN, NA, N/A, null, none and - are missing; ∞ and inf are over range. Lines that begin
+    with # are skipped; a line of separators alone starts a new record. The line above the numbers may hold names, such as
+    ``u,y``, ``time [ms],force [N],x [mm]`` or ``time_ms,force_N,x_mm``; or a line of names stands above a line of
+    units, such as ``ms,N,mm``. Lines above these are skipped. Numbers without names are the columns u and y, or time in
+    seconds, u and y. A column in a unit of time, or of dates or times of day, is the time, whatever its name.
 
     Args:
-        path: of the file.
-        input_name: name of the input's column; one of the usual names where it is None.
-        output_name: of the output's, likewise.
+        path: the file.
+        input_name: name of the input's column; None: one of the usual names.
+        output_name: name of the output's column; None: one of the usual names.
 
     Raises:
-        ValueError: naming the file, the line and what is wrong.
+        ValueError: naming the file, the line and the fault.
     """
     lines = read_text(path).splitlines()
     numbered_lines = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    if numbered_lines and (
-        separator_line := re.fullmatch(r"\s*\"?sep=(.)\"?\s*", numbered_lines[0][1])
-    ):  # a spreadsheet's
+    separator = None
+    if numbered_lines and (found := re.fullmatch(r"\s*\"?sep=(.)\"?\s*", numbered_lines[0][1])):  # of a spreadsheet
         numbered_lines.pop(0)
-    separator = (
-        separator_line.group(1)
-        if numbered_lines and separator_line
-        else guess_separator([line for _, line in numbered_lines])
-    )
-    line_numbers, fields = (
-        [k for k, _ in numbered_lines],
-        split_fields([line for _, line in numbered_lines], separator),
-    )
+        separator = found.group(1)
+    line_numbers, texts = [k for k, _ in numbered_lines], [line for _, line in numbered_lines]
+    separator = separator or guess_separator(texts)
+    fields = split_fields(texts, separator)
     first = find_first_row(fields, separator)
     if first is None:
         raise ValueError(f"{path} must hold numbers, but holds none")
     width = len(fields[first])
     names, units = read_headings(path, fields[:first], line_numbers, width, separator)
-    regular = parse_regular_rows([line for _, line in numbered_lines[first:]], separator, width)
-    rows = parse_rows(path, fields[first:], line_numbers[first:], separator) if regular is None else regular
+    rows: list[list[TableValue]] | list[list[float]] | None = parse_regular_rows(texts[first:], separator, width)
+    if rows is None:
+        rows = parse_rows(path, fields[first:], line_numbers[first:], separator)
     columns, stamped = timestamps_to_seconds(path, rows, line_numbers[first:], names)
     names = tuple(append_unit(path, name, unit) for name, unit in zip(names, units, strict=True)) if units else names
     places = locate_columns(path, names, len(columns), input_name, output_name, stamped)
-    return TextTable(path, names, columns, np.array(line_numbers[first:]), *places, has_timestamps=places[0] in stamped)
+    return TextTable(path, names, columns, np.array(line_numbers[first:]), *places, places.time in stamped)

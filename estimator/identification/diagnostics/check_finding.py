@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CheckFinding:
-    """What a check found.
+    """A finding of a check.
 
     Attributes:
-        name: of the check, such as ``"delay"``.
-        message: what was found, and what to do, in plain words.
-        parameters: those that it is about, where it is about some.
+        name: name of the check, such as ``"delay"``.
+        message: the finding and the remedy, in plain words.
+        parameters: the parameters that it concerns, if any.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Checks of the equation: missing terms, process noise, signs, asymmetry, lag and trigger offset."""
+"""Checks of the equation: missing terms, process noise, signs, an asymmetric spring, lag and trigger offset."""
 
 from __future__ import annotations
 
@@ -30,47 +30,51 @@ _MAX_DISTURBANCE_TO_LIMIT = 0.005
 #: The same in multiples of the disturbance that the rig states.
 _MAX_DISTURBANCE_TO_STATED = 3.0
 
-#: Standard deviations by which the disturbance is larger than that for sure: with a probability of 95 %, about.
+#: Standard deviations of a Gaussian's 95 % quantile.
 _STDS_FOR_95_PERCENT = 1.645
 
-#: Standard deviations below zero that are far.
+#: Standard deviations below zero from which a parameter counts as negative.
 _MAX_STDS_BELOW_ZERO = 5.0
 
-#: Corners of a high-pass in the output's channel that are tried, in parts of the mean frequency.
+#: Corner frequencies of a high-pass in the output's channel, relative to the mean frequency.
 _HIGH_PASS_CORNERS = (0.002, 0.005, 0.01, 0.02, 0.05)
 
 _TERM_DESCRIPTIONS = {
-    "cubic_damping": "a damping that grows with the cube of the velocity",
-    "quintic": "a stiffness of fifth order",
-    "dry_friction": "dry friction, a force against the motion that is the same at every speed",
+    "cubic_damping": "a damping force with the cube of the velocity",
+    "quintic": "a quintic stiffness",
+    "dry_friction": "dry friction, a force against the motion that does not depend on the speed",
 }
 
 
 def search_failed_finding(search_result: SearchResult) -> CheckFinding:
+    """The finding for a search whose best fit leaves a large disturbance, and whose starts do not agree."""
+    percents = 100 * search_result.relative_disturbance
     message = (
-        f"the search may have failed: what it found leaves a disturbance of {100 * search_result.relative_disturbance:.2g} % of the "
-        "input, and no two of its starts led to the same; m, c, a and b may be anything. Add a guess to the rig, or "
-        "identify from several records, of small motions too"
+        f"the search may have failed: its best fit leaves a disturbance of {percents:.2g} % of the input, and no two "
+        "starts agree; m, c, a and b may be wrong. Add a guess to the rig, or identify from several records, also of "
+        "small motions"
     )
     return CheckFinding("search_failed", message)
 
 
 def check_trigger_offset(problem: IdentificationProblem) -> list[CheckFinding]:
-    """Whether the channels were triggered far apart."""
+    """A finding where the channels were triggered far apart."""
     delay_samples = find_trigger_offset(problem)
     if delay_samples is None:
         return []
     delay = problem.rig.delay + delay_samples
-    what = (
-        f"the output answers {delay_samples} samples after the input; write delay = {delay:g} into the rig"
-        if delay_samples > 0
-        else f"the output answers {-delay_samples} samples before the input; cut {-delay_samples} samples from the start of the inputs"
-    )
+    if delay_samples > 0:
+        what = f"the output responds {delay_samples} samples after the input; write delay = {delay:g} into the rig"
+    else:
+        what = (
+            f"the output responds {-delay_samples} samples before the input; cut {-delay_samples} samples from the "
+            "start of the inputs"
+        )
     return [CheckFinding("delay", f"{what}, and identify again: the channels were triggered apart")]
 
 
 def check_missing_terms(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:
-    """Further terms of the equation, and a high-pass of the sensor, by their evidence."""
+    """A finding for the term of the equation, or the high-pass of the sensor, with the most evidence."""
     baseline, gains = float(search_result.fits.free_energy.min()), []
     for name in OPTIONAL_TERMS:
         prior = search_result.fitter.prior.extended(problem.term_prior(name))
@@ -82,26 +86,19 @@ def check_missing_terms(problem: IdentificationProblem, search_result: SearchRes
         replace(problem, y=tuple(undo_high_pass(y, part * problem.mean_frequency) for y in problem.y))
         for part in _HIGH_PASS_CORNERS
     ]
-    high_pass_gains = [
-        float(
-            baseline
-            - best_free_energies(search_result.fitter.for_problem(one), [search_result.best], search_result, baseline)[
-                0
-            ]
-        )
-        for one in filtered
-    ]
+    high_pass_gains = []
+    for one in filtered:
+        fitter = search_result.fitter.for_problem(one)
+        energies = best_free_energies(fitter, [search_result.best], search_result, baseline)
+        high_pass_gains.append(float(baseline - energies[0]))
     if max(high_pass_gains) > max(gains):
-        corner = (
-            _HIGH_PASS_CORNERS[int(np.argmax(high_pass_gains))]
-            * problem.mean_frequency
-            / (2 * np.pi * problem.rig.step)
-        )
+        relative_corner = _HIGH_PASS_CORNERS[int(np.argmax(high_pass_gains))]
+        corner = relative_corner * problem.mean_frequency / (2 * np.pi * problem.rig.step)
         message = (
-            f"the records speak for a high-pass of some {corner:.2g} Hz in the output's channel, by "
-            f"{max(high_pass_gains):.0f} nats, as an IEPE sensor or AC coupling has; c is wrong by it: couple the sensor by "
-            f"DC, or take one that reaches lower, because the same filter on the input does not help where the spring "
-            f"is not linear"
+            f"the records speak for a high-pass of about {corner:.2g} Hz in the output's channel, by "
+            f"{max(high_pass_gains):.0f} nats, such as of an IEPE sensor or AC coupling; it makes c wrong. Use DC "
+            f"coupling, or a sensor with a lower corner: the same filter on the input does not help with a nonlinear "
+            f"spring"
         )
         return [CheckFinding("high_pass", message)]
     term = OPTIONAL_TERMS[int(np.argmax(gains))]
@@ -112,47 +109,45 @@ def check_missing_terms(problem: IdentificationProblem, search_result: SearchRes
 
 
 def disturbance_message(channel: Channel, input_rms: float, disturbance_std: float) -> str:
-    """Says it where more disturbs the force than is usual; else nothing.
+    """A sentence where the disturbance of the force is larger than usual; else an empty string.
 
     Args:
         channel: the input.
-        input_rms: of the inputs, as a root mean square.
-        disturbance_std: of the force in every sample, as a standard deviation in the unit of the input.
+        input_rms: root mean square of the inputs.
+        disturbance_std: standard deviation of the disturbance in every sample, in the unit of the input.
     """
     usual_max = max(_MAX_DISTURBANCE_TO_INPUT * input_rms, _MAX_DISTURBANCE_TO_LIMIT * (channel.limit or 0.0))
     if disturbance_std <= (_MAX_DISTURBANCE_TO_STATED * channel.noise if channel.noise else usual_max):
         return ""
     part = f", {100 * disturbance_std / input_rms:.1f} % of the input" if input_rms else ""
-    return f"the force is disturbed by {disturbance_std:.3g} {channel.unit} in every sample{part}"
+    return f"the force has a disturbance of {disturbance_std:.3g} {channel.unit} in every sample{part}"
 
 
 def check_process_noise(problem: IdentificationProblem, disturbance: tuple[float, float]) -> list[CheckFinding]:
+    """A finding where the disturbance of the force, (mean, standard deviation), is surely larger than usual."""
     channel, input_rms, (mean, std) = problem.rig.input, problem.input_rms * problem.scales.input, disturbance
-    if not disturbance_message(
-        channel, input_rms, mean - _STDS_FOR_95_PERCENT * std
-    ):  # where the sensor's noise hides it, it may be any
+    # A disturbance that the sensor's noise hides has a wide interval, whose lower end is small.
+    if not disturbance_message(channel, input_rms, mean - _STDS_FOR_95_PERCENT * std):
         return []
-    because = "either the recorded input is noisy, or the equation lacks something"
-    return [CheckFinding("process_noise", f"{disturbance_message(channel, input_rms, mean)}; {because}")]
+    cause = "either the recorded input is noisy, or the equation lacks a term"
+    return [CheckFinding("process_noise", f"{disturbance_message(channel, input_rms, mean)}; {cause}")]
 
 
 def check_asymmetry(problem: IdentificationProblem, belief: Belief) -> list[CheckFinding]:
-    """Whether the spring rests beside its inflection, so that a is not its stiffness at rest."""
+    """A finding where the spring rests away from its inflection, so that a is not its stiffness at rest."""
     equilibrium = find_equilibrium(belief)
     if equilibrium is None or equilibrium.is_symmetric:
         return []
     scales = problem.scales
     stiffness, square = scales.unit((1, -1, 0)), scales.unit((1, -2, 0))
     motion_range = 3 * problem.displacement * scales.displacement
-    far = (
-        f", {abs(equilibrium.displacement_from_inflection) / motion_range:.2g} times as far as the oscillator moves"
-        if abs(equilibrium.displacement_from_inflection) > motion_range
-        else ""
-    )
+    distance = abs(equilibrium.displacement_from_inflection)
+    far = f", {distance / motion_range:.2g} times the range of the motion" if distance > motion_range else ""
     message = (
-        f"the spring is not symmetric about rest: at rest it is {_format_with_std(*equilibrium.stiffness)} {stiffness} stiff, with a "
-        f"quadratic stiffness of {_format_with_std(*equilibrium.quadratic)} {square}; a and b are those of its inflection, which is "
-        f"{abs(equilibrium.displacement_from_inflection):.3g} {scales.unit((0, 1, 0))} away{far}"
+        f"the spring is not symmetric about rest: at rest its stiffness is "
+        f"{_format_with_std(*equilibrium.stiffness)} {stiffness} and its quadratic stiffness "
+        f"{_format_with_std(*equilibrium.quadratic)} {square}; a and b hold at its inflection, which is "
+        f"{distance:.3g} {scales.unit((0, 1, 0))} away{far}"
     )
     return [CheckFinding("asymmetric", message)]
 
@@ -160,31 +155,31 @@ def check_asymmetry(problem: IdentificationProblem, belief: Belief) -> list[Chec
 def check_input_lag(
     problem: IdentificationProblem, parameters: Mapping[str, tuple[float, float]]
 ) -> list[CheckFinding]:
-    """Whether a lag of the input leaves the mass open: a coil's lag is also that of its own damping."""
+    """A finding where a lag of the input leaves the mass uncertain: a coil's damping lags as its force does."""
     lag, (m, std), (c, _) = problem.rig.input.lag, parameters["m"], parameters["c"]
     if lag is None or abs(c) * lag < std:
         return []
     message = (
         f"m may be {abs(c) * lag:.2g} {problem.scales.unit((1, -1, 2))} larger, {100 * abs(c * lag / m):.2g} %: where "
-        f"a coil that is driven by a voltage lags, so does the damping by its own motion, which looks like less mass; "
+        f"a coil that is driven by a voltage lags, its damping of the motion lags too, which looks like less mass; "
         f"record the current in place of the voltage"
     )
     return [CheckFinding("lag", message)]
 
 
 def _format_with_std(mean: float, std: float) -> str:
-    """A number with the digits that its standard deviation leaves."""
+    """A number with its standard deviation, and with as many digits as that allows."""
     digits = max(2, min(12, 2 + int(np.floor(np.log10(max(abs(mean) / max(std, 1e-300), 1.0))))))
     return f"{mean:.{digits}g} ± {std:.2g}"
 
 
 def check_signs(parameters: Mapping[str, tuple[float, float]]) -> list[CheckFinding]:
-    """Whether m is negative, or c without it: a channel that is turned round changes the sign of all four."""
+    """A finding where m is negative, or c alone: a channel of inverted polarity changes the sign of all four."""
     m, c = parameters["m"], parameters["c"]
     if m[0] < -_MAX_STDS_BELOW_ZERO * m[1]:
-        message = "m is negative: the polarity of the sensor or of the input is turned round; change the sign of u or y"
+        message = "m is negative: the polarity of the sensor or of the input is inverted; change the sign of u or y"
     elif c[0] < -_MAX_STDS_BELOW_ZERO * c[1]:
-        message = "c is negative: energy flows in, so that the oscillator is driven by more than u, such as a feedback"
+        message = "c is negative: energy flows in from another source than u, such as a feedback"
     else:
         return []
     return [CheckFinding("sign", message)]

@@ -1,4 +1,4 @@
-"""Checks of the rig's guess: beside what was found, and beside what the records say without it."""
+"""Checks of the rig's guess, against the identified parameters and against a fit without the guess."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ ParameterMoments = Mapping[str, tuple[float, float]]
 #: Parameter to its central 90 % interval.
 GuessIntervals = Mapping[str, tuple[float, float]]
 
-#: Standard deviations from the guess that are far.
+#: Standard deviations from the guess above which a parameter is reported.
 _MAX_STDS_FROM_GUESS = 5.0
 
-#: A guess leads astray where it moves a parameter by more than this part of it.
+#: Relative shift of a parameter by the guess that is reported.
 _MAX_RELATIVE_SHIFT = 0.01
 
 #: |log factor| from which a wrong step or scale is reported: nearer to a factor of 2, either way, than to 1.
@@ -35,12 +35,12 @@ _CHI_SQUARE_1_PERCENT = {2: 9.21, 3: 11.34, 4: 13.28}
 
 @dataclass(frozen=True)
 class _ScaleError:
-    """A number that may be wrong by a factor.
+    """A setting that may be wrong by a factor.
 
     Attributes:
-        check_name: its name.
-        message: with a place for the factor.
-        exponents: parameter to the power of the factor that would mend it; the first one tells the factor.
+        check_name: name of the finding.
+        message: message with a field for the factor.
+        exponents: parameter to the power of the factor that corrects it; the first parameter gives the factor.
     """
 
     check_name: str
@@ -48,10 +48,9 @@ class _ScaleError:
     exponents: Mapping[str, int]
 
 
-_STEP_MESSAGE = " would be those of the guess if the sampling step were about {:.2g} times the rig's"
+_STEP_MESSAGE = " would agree with the guess if the sampling step were about {:.2g} times the rig's"
 
-#: Kind of the output to what a wrong sampling step does: what the sensor shows keeps its scale, and not what is
-#: integrated or differentiated of it.
+#: Kind of the output to the effect of a wrong sampling step, which keeps the scale of the measured derivative alone.
 _STEP_ERRORS = {
     "displacement": _ScaleError("step", "m and c" + _STEP_MESSAGE, {"m": 2, "c": 1}),
     "velocity": _ScaleError("step", "m, a and b" + _STEP_MESSAGE, {"m": 1, "a": -1, "b": -3}),
@@ -61,33 +60,35 @@ _STEP_ERRORS = {
 _CALIBRATION_ERRORS = (
     _ScaleError(
         "guess",
-        "m, c, a and b would be those of the guess if the input were about {:.2g} times what is recorded; check its "
-        "unit and calibration, and those of the guess",
+        "m, c, a and b would agree with the guess if the input were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and the guess",
         {"m": 1, "c": 1, "a": 1, "b": 1},
     ),
     _ScaleError(
         "guess",
-        "m, c, a and b would be those of the guess if the output were about {:.2g} times what is recorded; check its "
-        "unit and calibration, and those of the guess",
+        "m, c, a and b would agree with the guess if the output were about {:.2g} times what is recorded; check its "
+        "unit and calibration, and the guess",
         {"m": -1, "c": -1, "a": -1, "b": -3},
     ),
 )
 
 
 def check_guess(guess: GuessIntervals, parameters: ParameterMoments, sensor_kind: str) -> list[CheckFinding]:
-    """Whether parameters are far from the guess, and what explains most of it; a negative mass is no matter of it.
+    """Findings where parameters are far from the guess, with the scale error that explains most of it.
+
+    A negative mass has a finding of its own (`estimator.identification.diagnostics.equation_checks.check_signs`).
 
     Args:
-        guess: of the rig.
-        parameters: that were found.
-        sensor_kind: of the output.
+        guess: the guess of the rig.
+        parameters: the identified parameters.
+        sensor_kind: kind of the output.
     """
     if parameters["m"][0] <= 0:
         return []
     squared_deviations, warnings = _squared_deviations(guess, parameters), list[CheckFinding]()
     far = [name for name, squared in squared_deviations.items() if squared > _MAX_STDS_FROM_GUESS**2]
     if far:
-        message = f"{', '.join(far)}: far outside of what the rig's guess says; check units, or the guess"
+        message = f"{', '.join(far)}: far outside of the rig's guess; check the units, or the guess"
         warnings = [CheckFinding("guess", message)]
     least = sum(squared_deviations.values()) / 2
     for scale_error in (_STEP_ERRORS[sensor_kind], *_CALIBRATION_ERRORS):
@@ -108,7 +109,7 @@ def check_guess(guess: GuessIntervals, parameters: ParameterMoments, sensor_kind
 
 
 def _squared_deviations(guess: GuessIntervals, parameters: ParameterMoments) -> dict[str, float]:
-    """Squared standard deviations between what is guessed of parameters and what was found."""
+    """Parameter to its squared distance from the guess, in variances of both."""
     guess_stds = {name: (high - low) / 2 / STDS_PER_90_PERCENT for name, (low, high) in guess.items()}
     return {
         name: float((parameters[name][0] - sum(guess[name]) / 2) ** 2 / (spread**2 + parameters[name][1] ** 2))
@@ -121,15 +122,19 @@ def _scaled(parameter: tuple[float, float], factor: float) -> tuple[float, float
 
 
 def fit_without_guess(problem: IdentificationProblem, search_result: SearchResult) -> tuple[ParameterMoments, float]:
-    """The parameters that the records alone give, and the nats by which the records are more probable with them.
+    """Fit the parameters without the guess, and compare the evidence.
 
-    Both fits are judged as if nothing were guessed, so that it does not count how improbable the guess holds them.
+    Both fits are judged without the guess, which would hold one of them for improbable.
+
+    Returns:
+        The parameters, and the nats by which the records are more probable with them; no parameters and 0 where the
+        records do not suffice without a guess.
     """
     try:
         result_without_guess = search_coefficients(
             replace(problem, rig=replace(problem.rig, guess=None)), lambda share, at="": None
         )
-    except ValueError:  # the records tell too little without a guess
+    except ValueError:  # the records do not suffice without a guess
         return {}, 0.0
     flat_prior_fitter = LaplaceFitter(search_result.fitter.problem, result_without_guess.fitter.prior)
     free_energy_with_guess = flat_prior_fitter.fit(
@@ -146,7 +151,7 @@ def fit_without_guess(problem: IdentificationProblem, search_result: SearchResul
 def is_shifted_by_guess(
     guess: GuessIntervals, parameters: ParameterMoments, parameters_without_guess: ParameterMoments
 ) -> bool:
-    """Whether the records alone say something else that matters."""
+    """Whether the records without the guess give another value of a guessed parameter."""
     return any(
         abs(parameters_without_guess[name][0] - parameters[name][0])
         > _MAX_RELATIVE_SHIFT * abs(parameters_without_guess[name][0])
@@ -161,12 +166,20 @@ def guess_conflict_findings(
     gain: float,
     sensor_kind: str,
 ) -> list[CheckFinding]:
-    """That the guess has led the fit astray: by so many nats the records are more probable with what they say alone."""
+    """Findings where the guess biases the fit.
+
+    Args:
+        guess: the guess of the rig.
+        parameters: the parameters with the guess.
+        parameters_without_guess: the parameters without it.
+        gain: nats by which the records are more probable without it.
+        sensor_kind: kind of the output.
+    """
     values = ", ".join(
         f"{name} = {parameters_without_guess[name][0]:.4g} and not {parameters[name][0]:.4g}" for name in guess
     )
-    conflict = f"the guess leads the fit astray: by {gain:.0f} nats the records speak for {values}"
-    why = check_guess(guess, parameters_without_guess, sensor_kind) or [
+    conflict = f"the guess biases the fit: by {gain:.0f} nats the records speak for {values}"
+    causes = check_guess(guess, parameters_without_guess, sensor_kind) or [
         CheckFinding("guess", "check the units of guess and columns, or leave out the guess")
     ]
-    return [CheckFinding(one.name, f"{conflict}; {one.message}") for one in why]
+    return [CheckFinding(one.name, f"{conflict}; {one.message}") for one in causes]

@@ -1,4 +1,4 @@
-"""Checks of identifiability: which parameters the records leave open."""
+"""Checks of identifiability: the parameters that the records leave open."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MAX_RELATIVE_WIDTH_OF_SINE = 0.02
 #: Largest deviation of an input from a sine, relative to the input.
 _SINE_TOLERANCE = 0.01
 
-#: Largest cubic force, in parts of the linear one, of a spring that is called linear.
+#: Largest cubic force of a spring that is called linear, relative to the linear force.
 _MAX_LINEAR_CUBIC_FRACTION = 0.05
 
 
@@ -39,6 +39,14 @@ def check_identifiability(
     ridges: RidgePosterior | None,
     parameters: dict[str, tuple[float, float]],
 ) -> list[CheckFinding]:
+    """A finding that names the parameters with wide intervals.
+
+    Args:
+        problem: the records, scaled.
+        search_result: the result of the search.
+        ridges: ridges of a posterior that is no Gaussian; None of a Gaussian.
+        parameters: parameter to mean and standard deviation, in the rig's units.
+    """
     reason = "this input; the records leave more than a third of it open"
     if ridges is None:
         unidentified = [
@@ -58,13 +66,13 @@ def check_identifiability(
     if unidentified:
         message = f"{', '.join(unidentified)}: not identified by {reason}"
         if "b" in unidentified and (part := _max_cubic_fraction(problem, parameters)) < _MAX_LINEAR_CUBIC_FRACTION:
-            message += f"; the spring is linear to {100 * part:.2g} %, as far as the oscillator moved"
+            message += f"; the spring is linear to {100 * part:.2g} % within the motion of the records"
         warnings.append(CheckFinding("not_identified", message, tuple(unidentified)))
     return warnings
 
 
 def _is_single_sine(inputs: Sequence[FloatArray]) -> bool:
-    """Whether all inputs (T,) are sines of one frequency and amplitude."""
+    """Whether all inputs (T,) are sines of the same frequency and amplitude."""
     found = []
     for u in inputs:
         centred = u - u.mean()
@@ -72,7 +80,7 @@ def _is_single_sine(inputs: Sequence[FloatArray]) -> bool:
         quarter = max(1, round(len(u) / max(2 * zero_crossings, 1)))
         if zero_crossings < 4 or len(u) < 8 * quarter:
             return False
-        # Of a sine the sum of two values a quarter earlier and later is that between them, times a constant.
+        # The sum of two values of a sine, a quarter earlier and later, is the value between them times a constant.
         middle, neighbours = centred[quarter:-quarter], centred[2 * quarter :] + centred[: -2 * quarter]
         factor = float(middle @ neighbours / (middle @ middle))
         if np.std(neighbours - factor * middle) > _SINE_TOLERANCE * middle.std():
@@ -82,14 +90,14 @@ def _is_single_sine(inputs: Sequence[FloatArray]) -> bool:
 
 
 def _max_cubic_fraction(problem: IdentificationProblem, parameters: Mapping[str, tuple[float, float]]) -> float:
-    """The largest part of the linear force that the cubic one may have been, within two standard deviations of b."""
+    """The largest cubic force, relative to the linear force, within two standard deviations of b."""
     largest = 3 * problem.displacement * problem.scales.displacement
     (a, _), (b, std) = parameters["a"], parameters["b"]
     return (abs(b) + 2 * std) * largest**2 / abs(a)
 
 
 def _stds_from_records_alone(problem: IdentificationProblem, search_result: SearchResult) -> dict[str, float]:
-    """Relative standard deviations that the records alone would leave of m, c, a and b."""
+    """Relative standard deviations of m, c, a and b from the records alone, without the prior."""
     model, mean, cov = problem.rig.model, search_result.mean, search_result.cov
     scale = np.sqrt(np.diag(cov))
     unit = np.outer(scale, scale)

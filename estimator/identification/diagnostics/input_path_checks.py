@@ -1,4 +1,4 @@
-"""How the input may have gone other than the rig says: between samples, with another delay, with a lag; by evidence."""
+"""Checks of the input path, by evidence: another interpolation between samples, another delay, or a lag."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, INTERPOLATION_DEGREES, MAX_DELAY
 from estimator.support.array_types import FloatArray
 
-#: Nats by which another hypothesis must be better.
+#: Evidence for another hypothesis that is reported, at least [nats].
 MIN_EVIDENCE = 7.0
 
-#: Ratios of the noises at which other hypotheses are tried, in parts of the best: a wrong one takes up noise.
+#: Factors of the best noise ratio at which other hypotheses are tried: a wrong hypothesis needs more noise.
 _NOISE_RATIO_FACTORS = (1.0, 0.1, 0.01)
 
 #: Delays that are tried, relative to the rig's [samples].
@@ -38,13 +38,13 @@ _REFINED_DELAY_FRACTIONS = (-0.5, -0.25, 0.25, 0.5)
 #: Time constants of a lag about the best hypothesis [samples].
 _REFINED_LAGS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
-#: Digits of a delay and of a lag in samples that are told.
+#: Decimals of a reported delay [samples]; a lag has one more.
 _REPORTED_DIGITS = 2
 
-#: An input is smooth where its second differences are this much smaller than itself, as a root mean square.
+#: Largest second differences of a smooth input, relative to the input, as root mean squares.
 _MAX_ROUGHNESS = 0.7
 
-#: Steps of a fit of another hypothesis, at most.
+#: Steps of the fit of another hypothesis, at most.
 _MAX_FIT_STEPS = 12
 
 #: Samples of each record on which hypotheses about the input are screened.
@@ -55,7 +55,12 @@ _SCREENING_LOSS = 10.0
 
 
 def check_input_path(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:
-    """What speaks for another path of the input, and which the rig should say."""
+    """A finding where the records speak for another path of the input than the rig states.
+
+    Args:
+        problem: the records, scaled.
+        search_result: the result of the search.
+    """
     rig, baseline = problem.rig, float(search_result.fits.free_energy.min())
     best = search_result.best
     paths = [
@@ -68,7 +73,7 @@ def check_input_path(problem: IdentificationProblem, search_result: SearchResult
         if (path, shift) != (rig.interpolation, 0)
     ]
     others += [replace(best, delay=rig.delay + shift) for shift in _LARGE_DELAY_SHIFTS]
-    # An accelerometer shows a held input itself: that it is sampled after this switches looks like a part of a sample.
+    # An accelerometer measures a held input directly: sampling just after a switch looks like a fractional delay.
     in_parts = rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS and (
         rig.output.kind != "acceleration" or _is_input_smooth(problem)
     )
@@ -86,13 +91,13 @@ def check_input_path(problem: IdentificationProblem, search_result: SearchResult
         best_alternative is None or best_alternative[1] <= MIN_EVIDENCE
     ) and rig.interpolation in FRACTIONAL_DELAY_INTERPOLATIONS[:2]:
         lagging = [replace(best, lag=best.lag + lag) for lag in _FIRST_LAGS]
-        if rig.interpolation == "linear" and not best.lag:  # what goes linearly resembles what is held and lags
+        if rig.interpolation == "linear" and not best.lag:  # a linear input resembles a held one with a lag
             lagging += [replace(best, interpolation="zero_order", delay=rig.delay - 1, lag=lag) for lag in _FIRST_LAGS]
         best_alternative = _best_alternative(problem, search_result, lagging, baseline)
     if best_alternative is None or best_alternative[1] <= MIN_EVIDENCE:
         return []
     alternative, gain = best_alternative
-    # Beside many samples parts of one are no matter, and what lags is not late by more than one.
+    # A delay of several samples is not refined, and a lag delays by one sample at most.
     if in_parts and abs(alternative.delay - rig.delay) <= 1:
         alternative, gain = _refine_delay_and_lag(problem, search_result, alternative, gain, baseline)
     return [_input_path_finding(problem, alternative, gain)]
@@ -101,7 +106,7 @@ def check_input_path(problem: IdentificationProblem, search_result: SearchResult
 def _best_alternative(
     problem: IdentificationProblem, search_result: SearchResult, hypotheses: Sequence[FitHypothesis], baseline: float
 ) -> tuple[FitHypothesis, float] | None:
-    """The best of some hypotheses and its gain in nats; None where none can be."""
+    """The best of some hypotheses and its gain in nats; None where no rig may have any of them."""
     hypotheses = _screen_hypotheses(problem, search_result, [other for other in hypotheses if _is_allowed(other)])
     if not hypotheses:
         return None
@@ -110,7 +115,7 @@ def _best_alternative(
 
 
 def _is_allowed(hypothesis: FitHypothesis) -> bool:
-    """Whether a rig may have it: an input that is held may act before the sample that it brings, others not."""
+    """Whether a rig may have the hypothesis: only a held input may act up to one sample early."""
     is_integer_delay = hypothesis.delay == int(hypothesis.delay)
     minimum = (-1.0 if hypothesis.interpolation == "zero_order" else 0.0) if is_integer_delay else -0.999
     return minimum <= hypothesis.delay <= MAX_DELAY and hypothesis.lag >= 0.0
@@ -119,7 +124,7 @@ def _is_allowed(hypothesis: FitHypothesis) -> bool:
 def _refine_delay_and_lag(
     problem: IdentificationProblem, search_result: SearchResult, hypothesis: FitHypothesis, gain: float, baseline: float
 ) -> tuple[FitHypothesis, float]:
-    """The delay in parts of a sample and the lag about a hypothesis, where these say more than whole samples do."""
+    """A hypothesis with a fractional delay and a lag, where these are better than whole samples; and its gain."""
     paths = [*FRACTIONAL_DELAY_INTERPOLATIONS[:2], *(["spline"] if _is_input_smooth(problem) else [])]
     middle = float(round(hypothesis.delay))
     others = [
@@ -149,10 +154,10 @@ def _refine_delay_and_lag(
 
 
 def _is_input_smooth(problem: IdentificationProblem) -> bool:
-    """Whether inputs change gently from sample to sample, as what a filter or an amplifier leaves of them."""
+    """Whether inputs change gently from sample to sample, as after a filter or an amplifier."""
     second_differences = np.concatenate([np.diff(u, 2) for u in problem.u])
     first_differences = np.concatenate([np.diff(u) for u in problem.u])
-    # What is held for some samples stands still between its jumps.
+    # An input that is held for several samples does not change between its jumps.
     is_held = np.mean(first_differences == 0.0) > 0.1
     return bool(not is_held and np.sqrt(np.mean(second_differences**2)) < _MAX_ROUGHNESS * problem.input_rms)
 
@@ -174,7 +179,7 @@ def _input_path_finding(problem: IdentificationProblem, alternative: FitHypothes
 def _screen_hypotheses(
     problem: IdentificationProblem, search_result: SearchResult, hypotheses: list[FitHypothesis]
 ) -> list[FitHypothesis]:
-    """Those that the first part of the records does not speak against; all, where that is no small part."""
+    """The hypotheses that fit the first part of the records; all of them, where that is no small part."""
     shortened = problem.truncated(_SCREENING_SAMPLES)
     if shortened.n_observed_outputs > problem.n_observed_outputs / 2 or not hypotheses:
         return hypotheses
@@ -187,10 +192,16 @@ def _screen_hypotheses(
 def best_free_energies(
     fitter: LaplaceFitter, hypotheses: Sequence[FitHypothesis], search_result: SearchResult, give_up_above: float
 ) -> FloatArray:
-    """(H,) free energies of other hypotheses, each in the best of some ratios of the noises.
+    """(H,) free energies of other hypotheses, each at the best of several noise ratios.
 
-    Those whose samples are alike are fitted side by side: a spline takes more arithmetic than what is held, and parts
-    of samples are more samples.
+    Hypotheses with the same polynomial degree are fitted together: a spline takes more arithmetic than a held input,
+    and a fractional delay has more samples.
+
+    Args:
+        fitter: fitter of the records.
+        hypotheses: the H hypotheses.
+        search_result: the result of the search, whose coefficients start the fits.
+        give_up_above: free energy above which a fit ends.
     """
     result = np.full(len(hypotheses), np.inf)
     groups: dict[tuple[int, bool], list[int]] = {}

@@ -1,4 +1,4 @@
-"""Checks of the records themselves: outliers, stops, limits, sampling rate, short impacts."""
+"""Checks of the recorded signals: outliers, clipping, dropouts, limits, sampling rate and short impacts."""
 
 from __future__ import annotations
 
@@ -38,11 +38,17 @@ RECOMMENDED_SAMPLES_PER_PERIOD = 6
 
 
 def check_records(problem: IdentificationProblem, records: Sequence[Record]) -> list[CheckFinding]:
+    """Findings about the recorded signals alone.
+
+    Args:
+        problem: the records, scaled.
+        records: the records as they were read.
+    """
     rig = problem.rig
     warnings = [*_check_outliers(rig.output, records), *_check_short_impacts(rig, records)]
     n_clipped = sum(one.n_clipped for one in records)
     if n_clipped:
-        message = f"{n_clipped} outputs stand at a stop and were taken as missing; widen the range, or drive it less"
+        message = f"{n_clipped} outputs are clipped and count as missing; widen the range, or reduce the input"
         warnings.append(CheckFinding("clipped", message))
     warnings += _check_stale_outputs(records)
     largest_input = max(np.abs(one.u).max() for one in records)
@@ -56,34 +62,38 @@ def check_records(problem: IdentificationProblem, records: Sequence[Record]) -> 
     if sink.range and largest_output > sink.range * (1 + 1e-6):
         message = f"outputs of {largest_output:.3g} {sink.unit} leave the rig's range of {sink.range:g} {sink.unit}"
         warnings.append(CheckFinding("range", message))
-    if 2 * np.pi / problem.mean_frequency < MIN_SAMPLES_PER_PERIOD:
-        message = f"there are {2 * np.pi / problem.mean_frequency:.1f} samples in a period; sample faster, {RECOMMENDED_SAMPLES_PER_PERIOD} at least"
+    samples_per_period = 2 * np.pi / problem.mean_frequency
+    if samples_per_period < MIN_SAMPLES_PER_PERIOD:
+        message = (
+            f"a period has {samples_per_period:.1f} samples; sample faster, with "
+            f"{RECOMMENDED_SAMPLES_PER_PERIOD} or more"
+        )
         warnings.append(CheckFinding("sampling_too_slow", message))
     return warnings
 
 
 def _check_stale_outputs(records: Sequence[Record]) -> list[CheckFinding]:
-    """Whether outputs stood still while the oscillator moved."""
+    """Findings about outputs that stand still while the oscillator moves."""
     warnings = []
     bursts, count = sum(one.n_bursts for one in records), sum(one.n_stale for one in records if one.n_bursts)
     if bursts:
         message = (
-            f"{count} outputs in {bursts} bursts stand still while the oscillator moves, as where a sensor loses its "
-            f"signal; they were taken as missing"
+            f"{count} outputs in {bursts} bursts stand still while the oscillator moves, as when a sensor loses its "
+            f"signal; they count as missing"
         )
         warnings.append(CheckFinding("dropouts", message))
     repeats = max(one.samples_per_value for one in records)
     if repeats > 1:
         message = (
-            f"each output stands {repeats} times, as where a slow sensor is sampled faster than it measures; the first "
-            f"was kept, and the others taken as missing: sample as fast as it measures, for its delay is unknown"
+            f"each output is repeated {repeats} times, as when a slow sensor is sampled faster than it measures; the "
+            f"first counts and the others count as missing. Sample at the sensor's own rate: its delay is unknown"
         )
         warnings.append(CheckFinding("repeated", message))
     return warnings
 
 
 def _check_short_impacts(rig: Rig, records: Sequence[Record]) -> list[CheckFinding]:
-    """Whether the input is blows of so few samples that their impulse is uncertain; not steps that a converter held."""
+    """A finding where the input is impacts of few samples, whose impulse is uncertain; not of steps that are held."""
     lengths, is_held, acting_samples = list[int](), list[bool](), 0
     largest = max(float(np.abs(one.u - np.median(one.u)).max()) for one in records)
     for one in records:
@@ -103,17 +113,17 @@ def _check_short_impacts(rig: Rig, records: Sequence[Record]) -> list[CheckFindi
     ):
         return []
     message = (
-        f"the input is blows that {np.median(lengths):.0f} samples see: their impulse, and with it m, c, a and b "
-        "alike, is known to some percent only, whatever the intervals say; sample faster, "
-        f"{_SUFFICIENT_IMPACT_SAMPLES} times in a blow at least"
+        f"the input is impacts of {np.median(lengths):.0f} samples: their impulse, and with it m, c, a and b, is known "
+        "to a few percent only, and the intervals do not show it; sample faster, "
+        f"{_SUFFICIENT_IMPACT_SAMPLES} times in an impact or more"
     )
     return [CheckFinding("short_blows", message)]
 
 
 def _check_outliers(channel: Channel, records: Sequence[Record]) -> list[CheckFinding]:
-    """Outputs that are far off alone, which spoil the fit that the other checks judge.
+    """A finding about single outputs far from all others, which spoil the fit that the other checks judge.
 
-    Not of accelerations, which answer an impulse at once.
+    Accelerations have none: they respond to an impulse at once.
     """
     if channel.kind == "acceleration":
         return []
@@ -133,10 +143,9 @@ def _check_outliers(channel: Channel, records: Sequence[Record]) -> list[CheckFi
     if not outliers or quantile_99 == 0:
         return []
     _, k, one = max(outliers, key=lambda place: float(place[0]))
-    many = "1 output stands" if len(outliers) == 1 else f"{len(outliers)} outputs stand"
+    count = "1 output is an outlier" if len(outliers) == 1 else f"{len(outliers)} outputs are outliers"
     message = (
-        f"{many} alone, far off all others: sample {k} of {one.name} is {one.y[k]:.3g} "
-        f"{channel.unit}, and 99 % are within {quantile_99:.3g} {channel.unit} of the middle; make them missing, and "
-        "identify again, before anything else is looked at"
+        f"{count}: sample {k} of {one.name} is {one.y[k]:.3g} {channel.unit}, and 99 % of the outputs are within "
+        f"{quantile_99:.3g} {channel.unit} of the median; make them missing (NaN), and identify again before all else"
     )
     return [CheckFinding("outliers", message)]

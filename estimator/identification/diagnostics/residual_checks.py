@@ -14,20 +14,31 @@ from estimator.support.array_types import FloatArray
 
 
 def standardised_innovations(y: FloatArray, forecast: FloatArray) -> FloatArray:
-    """(n,) standardised innovations of the outputs that were seen."""
+    """(n,) standardised innovations of the outputs that are not missing.
+
+    Args:
+        y: (T,) outputs; NaN where one is missing.
+        forecast: (T, 2) mean and variance of each, one sample ahead.
+    """
     with np.errstate(invalid="ignore"):
         values = (y - forecast[:, 0]) / np.sqrt(forecast[:, 1])
     return values[np.isfinite(values)]
 
 
-#: Probability of a false alarm of a test of the residuals.
+#: Probability of a false alarm in each test of the residuals.
 _FALSE_ALARM_PROBABILITY = 1e-4
 
 
 def check_residuals(
     problem: IdentificationProblem, records: Sequence[Record], forecasts: Sequence[FloatArray]
 ) -> list[CheckFinding]:
-    """Whether what the forecasts left is white and normal."""
+    """Findings about forecast errors that are not white or not normal.
+
+    Args:
+        problem: the records, scaled.
+        records: the records as they were read.
+        forecasts: per record, (T, 2) mean and variance of each output, one sample ahead.
+    """
     from statistics import NormalDist
 
     residuals_of_records = [
@@ -38,7 +49,7 @@ def check_residuals(
     n, warnings = len(values), list[CheckFinding]()
     if n < 100:
         return warnings
-    lags, most = 20, 52.386  # chi2.isf(_ALARM, lags): SciPy's statistics take longer to import than records to identify
+    lags, most = 20, 52.386  # chi2.isf(1e-4, 20); SciPy's statistics take longer to import than this function to run
     products = [
         sum(float(one[k:] @ one[: len(one) - k]) for one in residuals_of_records if len(one) > k)
         for k in range(lags + 1)
@@ -46,12 +57,13 @@ def check_residuals(
     statistic = n * sum((products[k] / products[0]) ** 2 for k in range(1, lags + 1))
     if statistic > most:
         message = (
-            "errors of the forecasts can be foreseen: the equation, the way of the input or the noise is not as assumed"
+            "the forecast errors are correlated, not white: the equation, the interpolation of the input or the noise "
+            "is not as assumed"
         )
         warnings.append(CheckFinding("residuals_not_white", message))
     centred = (values - values.mean()) / values.std()
     kurtosis = (np.mean(centred**4) - 3) * np.sqrt(n / 24)
     if abs(kurtosis) > 6.0 or np.abs(centred).max() > -NormalDist().inv_cdf(_FALSE_ALARM_PROBABILITY / n / 2):
-        message = "errors of the forecasts are not normal: there are outliers, or the noise comes and goes"
+        message = "the forecast errors are not normal: the output has outliers, or the noise varies in time"
         warnings.append(CheckFinding("residuals_not_normal", message))
     return warnings

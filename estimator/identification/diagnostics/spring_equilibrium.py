@@ -1,4 +1,4 @@
-"""Where a spring rests, and how stiff it is there: a constant force moves a spring away from its inflection."""
+"""Equilibrium of a spring and its stiffness there: a constant force moves a spring away from its inflection."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _MIN_STDS_OF_STIFFNESS = 3.0
 
 
 class SpringEquilibrium(NamedTuple):
-    """A spring at rest.
+    """The equilibrium of a spring.
 
     Attributes:
-        displacement_from_inflection: displacement from the inflection, where a x + b x³ + u0 = 0.
-        stiffness: a + 3 b x² there; mean and standard deviation.
-        quadratic: 3 b x, of the force that grows with the square of the displacement from rest; likewise.
-        is_symmetric: whether the stiffness is a as far as can be told, or as far as matters.
+        displacement_from_inflection: displacement x from the inflection, where a x + b x³ + u0 = 0.
+        stiffness: mean and standard deviation of the stiffness there, a + 3 b x².
+        quadratic: mean and standard deviation of the quadratic stiffness there, 3 b x.
+        is_symmetric: whether the stiffness there agrees with a, or differs by less than matters.
     """
 
     displacement_from_inflection: float
@@ -35,7 +35,7 @@ class SpringEquilibrium(NamedTuple):
 
 
 def find_equilibrium(belief: Belief) -> SpringEquilibrium | None:
-    """The rest of a spring nearest to its inflection, to first order in the parameters; None of one with two wells."""
+    """The equilibrium nearest to the inflection, to first order in the parameters; None of a spring with two wells."""
     names = list(belief.model.physical)
     mean, cov = belief.physical()
     parameters = dict(zip(names, mean, strict=True))
@@ -50,7 +50,7 @@ def find_equilibrium(belief: Belief) -> SpringEquilibrium | None:
     k = a + 3 * b * x**2
     if k <= 0:
         return None
-    # Slopes by a, b and u0: of the place, then of what follows from it.
+    # Derivatives by a, b and u0, of the displacement and then of both stiffnesses.
     displacement_slope = -np.array([x, x**3, 1.0]) / k
     jacobian = np.array(
         [

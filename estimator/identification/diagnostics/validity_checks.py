@@ -1,4 +1,4 @@
-"""Checks of an identification: what would make its intervals wrong, and can be seen in the records."""
+"""All checks of an identification: faults that show in the records and make its intervals wrong."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from estimator.identification.fitting.search_result import SearchResult
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.support.array_types import FloatArray
 
-#: Smallest errors of the forecasts, in parts of the output, that are judged: smaller ones are those of the integration,
-#: and all that is left of a simulated record without noise.
+#: Relative forecast error below which no check of the noise runs: a simulated record without noise leaves the errors
+#: of the integration alone.
 _MIN_JUDGED_ERROR = 1e-6
 
 
@@ -48,34 +48,33 @@ def run_all_checks(
     records: Sequence[Record],
     forecasts: Sequence[FloatArray],
 ) -> tuple[CheckFinding, ...]:
-    """All checks.
+    """Run all checks.
 
     Args:
         problem: the records, scaled.
         search_result: the result of the search.
-        ridges: along which the posterior lies where it is no Gaussian.
+        ridges: ridges of a posterior that is no Gaussian; None of a Gaussian.
         belief: the posterior.
-        parameters: their means and standard deviations, in the rig's units.
-        disturbance: of the force, as a standard deviation in the unit of the input; its mean and standard deviation.
-        records: as they were read.
-        forecasts: of their outputs.
+        parameters: parameter to mean and standard deviation, in the rig's units.
+        disturbance: mean and standard deviation of the force's disturbance, which is a standard deviation per sample in
+            the unit of the input.
+        records: the records as they were read.
+        forecasts: per record, (T, 2) mean and variance of each output, one sample ahead.
     """
-    if problem.is_free_decay:  # nothing is known of an input, and m is 1
+    if problem.is_free_decay:  # without an input, and with m = 1 by definition
         return (
             *check_records(problem, records),
             *check_missing_terms(problem, search_result),
             *check_identifiability(problem, search_result, None, parameters),
             *check_residuals(problem, records, forecasts),
         )
-    guess, record_findings, has_noise = (
-        problem.rig.guess,
-        check_records(problem, records),
-        _expected_forecast_error(records, forecasts) > _MIN_JUDGED_ERROR,
-    )
+    guess, kind = problem.rig.guess, problem.rig.output.kind
+    record_findings = check_records(problem, records)
+    has_noise = _expected_forecast_error(records, forecasts) > _MIN_JUDGED_ERROR
     input_path_findings = check_input_path(problem, search_result) if has_noise else []
     if not input_path_findings and (search_result.has_failed or check_process_noise(problem, disturbance)):
         input_path_findings = check_trigger_offset(problem)
-    if search_result.has_failed and not input_path_findings:  # the other checks would blame the equation
+    if search_result.has_failed and not input_path_findings:  # the other checks would name the equation
         return (*record_findings, search_failed_finding(search_result))
     fit_findings = [
         *(input_path_findings or (check_missing_terms(problem, search_result) if has_noise else [])),
@@ -84,25 +83,20 @@ def run_all_checks(
         *check_asymmetry(problem, belief),
         *check_input_lag(problem, parameters),
         *check_identifiability(problem, search_result, ridges, parameters),
-        *([] if guess is None else check_guess(guess, parameters, problem.rig.output.kind)),
+        *([] if guess is None else check_guess(guess, parameters, kind)),
         *(check_residuals(problem, records, forecasts) if has_noise else []),
     ]
     if guess is not None and fit_findings:
         alone, gain = fit_without_guess(problem, search_result)
-        if gain > MIN_EVIDENCE and is_shifted_by_guess(
-            guess, parameters, alone
-        ):  # the other checks judge a fit that it spoilt
-            kind = problem.rig.output.kind
-            return (
-                *record_findings,
-                *check_signs(alone),
-                *guess_conflict_findings(guess, parameters, alone, gain, kind),
-            )
+        if gain > MIN_EVIDENCE and is_shifted_by_guess(guess, parameters, alone):
+            # The other findings judge a fit that the guess has spoilt.
+            conflicts = guess_conflict_findings(guess, parameters, alone, gain, kind)
+            return (*record_findings, *check_signs(alone), *conflicts)
     return (*record_findings, *fit_findings)
 
 
 def _expected_forecast_error(records: Sequence[Record], forecasts: Sequence[FloatArray]) -> float:
-    """Errors to be expected of the forecasts, in parts of the outputs' deviation."""
+    """Median standard deviation of the forecasts, relative to the standard deviation of the outputs."""
     variances = np.concatenate(
         [forecast[np.isfinite(one.y), 1] for one, forecast in zip(records, forecasts, strict=True)]
     )

@@ -1,1 +1,1 @@
-"""From nothing to a posterior: weak form, multistart, profile likelihood."""
+"""Fitting of coefficients and noises: starting points, searches, profile likelihoods, and the posterior belief."""

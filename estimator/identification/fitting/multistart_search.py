@@ -1,4 +1,4 @@
-"""The search: from nothing, or a guess, to the coefficients and noises that the records leave."""
+"""Multistart search for the most probable coefficients and noises, from the records and an optional guess."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from estimator.rigs.rig_prior import rig_prior
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback
 
-#: Standard deviation of the gain where no input tells it, and it is 1 by the scales.
+#: Standard deviation of the gain of a free decay, which is 1 by the scales.
 _KNOWN_GAIN_STD = 1e-6
 
-#: Without a guess a coefficient is believed to be about 0, within so many of its natural sizes.
+#: Standard deviation of a coefficient without a guess, in natural sizes; its mean is 0.
 _WIDE_PRIOR_FACTOR = 30.0
 
 #: Disturbance of a good result, as a fraction of the input, at most; above it other starts are drawn.
@@ -38,11 +38,11 @@ _MAX_GOOD_DISTURBANCE = 0.05
 #: Rounds of random starts, at most.
 _MAX_RESTARTS = 3
 
-#: Nats by which the free energies of results that are the same differ at most.
+#: Difference of the free energies of equal optima, at most [nats].
 _SAME_OPTIMUM_NATS = 5.0
 
-#: Runge-Kutta steps per sample; the fewest with a small error are taken. The method has order 4, and the most are enough
-#: for motions of a third of a period per sample.
+#: Runge-Kutta steps of order 4 per sample, of which the fewest with a small error are taken; the most are enough for
+#: motions of a third of a period per sample.
 _SUBSTEP_CHOICES = (2, 4, 8, 16, 32)
 
 #: Largest error of the integration, in standard deviations of stiffness and damping.
@@ -65,7 +65,7 @@ _MIN_NOISE_CHANGE_STDS = 6.0
 
 
 def coefficient_prior(problem: IdentificationProblem) -> CoefficientPrior:
-    """What the rig's guess says of the coefficients; next to nothing where there is none."""
+    """The prior of the coefficients: the rig's guess, or a wide one without a guess."""
     if problem.rig.guess is None:
         natural = problem.natural_coefficient_sizes()
         names = list(problem.model.coefficients)
@@ -78,14 +78,14 @@ def coefficient_prior(problem: IdentificationProblem) -> CoefficientPrior:
 
 
 def search_coefficients(problem: IdentificationProblem, on_progress: ProgressCallback) -> SearchResult:
-    """Find the coefficients and the noises, for the rig's own interpolation and delay.
+    """Find the coefficients and the noises, for the rig's interpolation and delay.
 
     Args:
         problem: the records.
-        on_progress: is told the share that is done, by experience, and what is being done.
+        on_progress: receives the approximate share that is done, and the current step.
 
     Raises:
-        ValueError: where no start leads anywhere.
+        ValueError: where the fits from all starts diverge.
     """
     coarse_substeps = next(n for n in _SUBSTEP_CHOICES if problem.mean_frequency / n < _MAX_SUBSTEP_ANGLE)
     fitter = LaplaceFitter(replace(problem, substeps=coarse_substeps), coefficient_prior(problem))
@@ -93,8 +93,8 @@ def search_coefficients(problem: IdentificationProblem, on_progress: ProgressCal
     first_fits = fit_first_starts(fitter)
     if not len(first_fits.mean):
         raise ValueError(
-            "records must be of an oscillator that Eq. (1) can follow, and show what the input does for a few periods, "
-            "but every start ran away; check units, columns and the sampling step, or add a guess to the rig"
+            "records must be of an oscillator that Eq. (1) can follow, with a few periods of response to the input, "
+            "but every start diverged; check units, columns and the sampling step, or add a guess to the rig"
         )
     on_progress(0.3, "fitting coefficients and noises")
     result = _settle_best_start(fitter, first_fits)
@@ -105,16 +105,16 @@ def search_coefficients(problem: IdentificationProblem, on_progress: ProgressCal
 
 
 def _restart_and_settle(fitter: LaplaceFitter, first_result: SearchResult) -> SearchResult:
-    """The best of what was found and of what other starts lead to.
+    """The best of a poor result and of results from random starts.
 
-    Where these come to the same it is not the start that is wrong, and none is sought after one that is not poor.
+    Where the two best agree, the start is not the fault. A result that is not poor ends the search too.
     """
     energy = lambda end: float(end.fits.free_energy.min())  # noqa: E731
     results = [first_result]
     for seed in range(_MAX_RESTARTS):
         random_fits = fit_random_starts(fitter, seed)
         for k in range(len(random_fits.mean)):
-            with suppress(ValueError):  # it ran away
+            with suppress(ValueError):  # it diverged
                 results.append(_settle_best_start(fitter, random_fits.select(np.array([k]))))
             results.sort(key=energy)
             is_same_optimum = len(results) > 1 and energy(results[1]) < energy(results[0]) + _SAME_OPTIMUM_NATS
@@ -124,7 +124,7 @@ def _restart_and_settle(fitter: LaplaceFitter, first_result: SearchResult) -> Se
 
 
 def _settle_best_start(fitter: LaplaceFitter, start_fits: LaplaceFits) -> SearchResult:
-    """What the best of some fits comes to, with as many steps of integration and the motions that it needs."""
+    """The result from the first of some fits, with the substeps, initial states and record noises that it needs."""
     problem, hypothesis = fitter.problem, start_fits.hypotheses[0]
     start, sensor_std, reach = start_fits.mean[0], float(start_fits.sensor_std[0]), 30.0
     substeps = required_substeps(problem, start, start_fits.cov[0])
@@ -149,7 +149,7 @@ def _settle_best_start(fitter: LaplaceFitter, start_fits: LaplaceFits) -> Search
 
 
 def _noise_scales_changed(problem: IdentificationProblem, noise_scales: FloatArray) -> bool:
-    """Whether the noises of some records are other than was thought, surely and by so much that it matters."""
+    """Whether the noises of some records differ from the assumed ones, significantly and by enough to matter."""
     before = np.ones(len(noise_scales)) if problem.record_noise_scales is None else problem.record_noise_scales
     n_observed = np.array([np.isfinite(y).sum() for y in problem.y])
     change = np.abs(np.log(np.maximum(noise_scales, 1e-300) / before))
@@ -161,13 +161,16 @@ def _noise_scales_changed(problem: IdentificationProblem, noise_scales: FloatArr
 
 
 def spread_along_ridge(result: SearchResult, names: Sequence[str]) -> SearchResult:
-    """The same, along the ridge on which the posterior of some parameters lies where it is no Gaussian."""
+    """The result along the ridge of the posterior of some parameters; unchanged where the posterior is a Gaussian."""
     profile = profile_posterior(result.fits, int(np.argmax(result.weights)), result.fitter, names)
-    return result if profile is None else replace(result, fits=profile[0], weights=profile[1], ridges=profile[2])
+    if profile is None:
+        return result
+    fits, weights, ridges = profile
+    return replace(result, fits=fits, weights=weights, ridges=ridges)
 
 
 def _initial_states_changed(result: SearchResult) -> bool:
-    """Whether the records begin in motions other than the filter was linear about, and it matters."""
+    """Whether new initial states of the records change the free energy."""
     initial_states = find_initial_states(result.fitter.problem, result.best, result.mean[None], result.sensor_std)
     hypothesis = replace(result.best, initial_states=initial_states[0])
     fits = result.fitter.fit([result.best, hypothesis], result.mean, result.sensor_std, iterations=0)
@@ -176,10 +179,10 @@ def _initial_states_changed(result: SearchResult) -> bool:
 
 
 def required_substeps(problem: IdentificationProblem, mean: FloatArray, cov: FloatArray) -> int:
-    """The fewest steps of integration whose error is tolerable, for coefficients (K,) with a covariance (K, K).
+    """The fewest substeps with a tolerable integration error, for coefficients (K,) with a covariance (K, K).
 
-    In steps of the phase z = ω/n Runge and Kutta's method of order 4 turns by z⁵/120 too little and loses z⁶/144 of the
-    amplitude: what this adds to stiffness and damping is compared with their standard deviations.
+    In a step of the phase z = ω/n, the Runge-Kutta method of order 4 turns by z⁵/120 too little and loses z⁶/144 of
+    the amplitude. The effect on stiffness and damping is compared with their standard deviations.
     """
     names = list(problem.model.coefficients)
     coefficients, std = (dict(zip(names, v, strict=True)) for v in (mean, np.sqrt(np.diag(cov))))

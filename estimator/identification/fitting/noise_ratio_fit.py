@@ -36,18 +36,22 @@ def fit_noise_ratio(
     sensor_std: float,
     ratio_reach: float,
 ) -> SearchResult:
-    """The posterior over coefficients and noises, of one hypothesis about all else.
+    """The posterior over coefficients and noises, for one hypothesis about all else.
 
-    A grid of ratios is laid about the best and narrowed, until it is finer than what the records leave open. Where they
-    do not tell σ_w from 0, or σ_v, the prior decides: half a Cauchy density of the ratio (Gelman 2006), about the one
-    that moves the output as much as it disturbs it. One even in the logarithm would hold that one of the noises is 0.
+    A grid of noise ratios about the best is narrowed until it is finer than the posterior. Where the records do not
+    distinguish σ_w or σ_v from 0, the prior decides: a half-Cauchy density of the ratio (Gelman 2006), scaled to the
+    ratio at which both noises have the same effect on the output. A density that is flat in the logarithm would hold
+    one of the noises for 0.
 
     Args:
-        fitter: of the records.
-        hypothesis: with the ratio to begin at.
-        initial_coefficients: (K,) coefficients to begin at.
-        sensor_std: σ_v to begin with.
+        fitter: fitter of the records.
+        hypothesis: the hypothesis, with the ratio to start from.
+        initial_coefficients: (K,) coefficients to start from.
+        sensor_std: σ_v to start from.
         ratio_reach: factor of the ratio, either way, that the first grid spans.
+
+    Raises:
+        ValueError: where every fit diverges.
     """
     unit = fitter.problem.mean_frequency ** (2 - fitter.problem.scales.order)
     bounds = np.log([_MIN_NOISE_RATIO * unit, _MAX_NOISE_RATIO * unit])
@@ -57,8 +61,8 @@ def fit_noise_ratio(
         fits = fitter.fit(with_noise_ratios(hypothesis, np.exp(logs)), initial_coefficients, sensor_std)
         if not np.isfinite(fits.free_energy).any():
             raise ValueError(
-                "records must keep the fit finite, but it ran away; check units and the sampling step, and give a "
-                "simulated record some noise, of 1e-8 of its size at least"
+                "records must keep the fit finite, but it diverged; check units and the sampling step, and add noise "
+                "to a simulated record, at least 1e-8 of its size"
             )
         log_ratios_from_unit = logs - np.log(unit)
         energies = fits.free_energy + neg_log_half_cauchy(log_ratios_from_unit)
@@ -79,7 +83,7 @@ def fit_noise_ratio(
 
 
 def _parabola_moments(places: FloatArray, energies: FloatArray, best: int) -> tuple[float, float]:
-    """Mean and standard deviation of what has the free energies of the parabola through the best and its neighbours."""
+    """Mean and standard deviation of the Gaussian whose free energy is the parabola through the best three points."""
     if not 0 < best < len(places) - 1:
         return float(places[best]), np.inf
     left, right = places[best] - places[best - 1], places[best + 1] - places[best]

@@ -1,9 +1,10 @@
-"""Beliefs of what a search left: the rig's own posterior, how it contracts, and that from a belief near it."""
+"""The posterior belief of a search: moments in the rig's model, forecasts, contraction history, and a refit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,11 +23,11 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import belief_from_moments
 from estimator.support.array_types import FloatArray
 
-#: Steps of integration a sample: enough for motions of a third of a period a sample, and always the same, so that a run
-#: compiles before it begins.
+#: Integration steps per sample in a refit: enough for motions of a third of a period per sample, and constant, so that
+#: a run compiles before it begins.
 _REFIT_SUBSTEPS = 16
 
-#: Factor of the ratio of the noises, either way, within which a search from a belief begins.
+#: Factor of the noise ratio, either way, that the first grid of a refit spans.
 _REFIT_RATIO_REACH = 3.0
 
 #: Times that the records are halved for the history, at most.
@@ -38,14 +39,31 @@ _MIN_HISTORY_SAMPLES = 50
 #: Steps of a fit of the history, at most.
 _MAX_HISTORY_FIT_STEPS = 12
 
-#: Outputs that were used, with the mean and standard deviation of each parameter that they leave.
-ContractionHistory = tuple[tuple[int, dict[str, tuple[float, float]]], ...]
+
+class ContractionStep(NamedTuple):
+    """The parameters after the first outputs of the records.
+
+    Attributes:
+        n_outputs: number of outputs.
+        parameters: parameter to mean and standard deviation.
+    """
+
+    n_outputs: int
+    parameters: dict[str, tuple[float, float]]
+
+
+ContractionHistory: TypeAlias = tuple[ContractionStep, ...]
 
 
 def posterior_belief(
     problem: IdentificationProblem, search_result: SearchResult
 ) -> tuple[Belief, dict[str, tuple[float, float]]]:
-    """The posterior of the rig's own model, and the noises' standard deviations in its units."""
+    """The posterior of the rig's model, and ``input`` and ``output`` to mean and standard deviation of the noise.
+
+    Args:
+        problem: the records.
+        search_result: the result of the search.
+    """
     rig, scales = problem.rig, problem.scales
     belief = belief_from_moments(rig, scales, *problem.moments_about_zero(search_result.mean, search_result.cov))
     shapes = np.full(len(search_result.weights), problem.n_observed_outputs / 2)
@@ -64,18 +82,18 @@ def posterior_belief(
 
 
 def disturbance_std(belief: Belief) -> float:
-    """Of the force in every sample, as a standard deviation in the unit of the input."""
+    """Standard deviation of the disturbance of the force in every sample, in the unit of the input."""
     return _unit_noise_force(belief) * float(np.sqrt(belief.noises[1] / belief.noises[0]))
 
 
 def _unit_noise_force(belief: Belief) -> float:
-    """The input that moves the velocity, when it is held over a sample, as a process noise of 1 does."""
+    """The input that, held over a sample, changes the velocity as much as a process noise of 1."""
     gain = dict(zip(belief.model.coefficients, belief.coefficients_mean, strict=True))["gain"]
     return float(belief.scales.input * np.sqrt(3) / abs(gain))
 
 
 def _with_initial_state_cov(belief: Belief, problem: IdentificationProblem) -> FloatArray:
-    """The covariance, with a state that may be anywhere in the records' motion."""
+    """The covariance with an unknown state, anywhere in the motion of the records."""
     cov, n = belief.cov, belief.model.n_states
     cov[:n, :n] = problem.initial_state_cov + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
     if DERIVATIVE_ORDER_OF_SENSOR[problem.rig.output.kind] == 0:
@@ -87,14 +105,14 @@ def _with_initial_state_cov(belief: Belief, problem: IdentificationProblem) -> F
 def one_step_forecasts(
     search_result: SearchResult, belief: Belief, n_observed: int | None = None
 ) -> tuple[FloatArray, ...]:
-    """Of each record (T, 2): mean and variance of each output before it was seen, in the rig's units.
+    """Per record, (T, 2) mean and variance of each output, one sample ahead, in the rig's units.
 
-    Coefficients and noises are at their means, and a record begins in the motion that was found.
+    Coefficients and noises are at their means, and each record begins in its most probable state.
 
     Args:
         search_result: the result of the search.
         belief: its posterior.
-        n_observed: outputs that are shown to the filter; all where it is None. The others it foresees from the inputs.
+        n_observed: outputs that the filter observes, from which on it predicts by the inputs alone; None: all.
     """
     problem, best = search_result.fitter.problem, search_result.best
     observed = tuple(
@@ -123,6 +141,7 @@ def one_step_forecasts(
 
 
 def _mixture_std(weights: FloatArray, values: FloatArray, shapes: FloatArray) -> float:
+    """Standard deviation of a noise over a mixture of Gamma posteriors with given shapes."""
     mean = weights @ values
     return float(np.sqrt(weights @ ((values - mean) ** 2 + values**2 / (4 * shapes))))
 
@@ -130,10 +149,14 @@ def _mixture_std(weights: FloatArray, values: FloatArray, shapes: FloatArray) ->
 def contraction_history(
     problem: IdentificationProblem, search_result: SearchResult, parameters: dict[str, tuple[float, float]]
 ) -> ContractionHistory:
-    """The parameters that the first half of every record leaves, the first quarter, and so on; shortest first.
+    """The parameters after growing first parts of every record: halves of halves, a quarter, a half, and all.
 
-    Each is a fit of its own from what all samples say, with the noises in the best ratio. One that runs away is left
-    out. Last come the ``parameters`` that all leave.
+    Each is a fit that starts from the result of all samples, at its noise ratio. A fit that diverges is left out.
+
+    Args:
+        problem: the records.
+        search_result: the result of the search.
+        parameters: the parameters after all samples, which come last.
     """
     longest, history = max(len(u) for u in problem.u), []
     for halvings in range(_MAX_HALVINGS, 0, -1):
@@ -149,26 +172,26 @@ def contraction_history(
                 problem.rig, problem.scales, *problem.moments_about_zero(fits.mean[0], fits.cov[0])
             )
             moments = {name: (mean, std) for name, (mean, std, _) in belief.parameters().items()}
-            history.append((short.n_observed_outputs, moments))
-    return (*history, (problem.n_observed_outputs, parameters))
+            history.append(ContractionStep(short.n_observed_outputs, moments))
+    return (*history, ContractionStep(problem.n_observed_outputs, parameters))
 
 
 def refit_coefficients(
     rig: Rig, records: Sequence[tuple[FloatArray, FloatArray]], prior: Belief, initial_belief: Belief
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit the coefficients to all records at once, from the belief of an estimator that took every sample once.
+    """Fit the coefficients to all records at once, starting from the belief of an online estimator.
 
-    A Gaussian that takes every sample once becomes sure too soon where two coefficients at first show as one, such as
-    the cubic stiffness and the sensor's offset of a rig with two wells. All records at once do not.
+    An online Gaussian filter becomes overconfident where two coefficients are hard to distinguish at first, such as the
+    cubic stiffness and the sensor's offset of a rig with two wells. A fit to all records does not.
 
     Args:
-        rig: that they are of.
+        rig: the rig of the records.
         records: pairs (u, y) of arrays (T,) in the rig's units, paired by index; each may begin in any motion.
-        prior: what is believed before them.
-        initial_belief: the belief that the search begins at.
+        prior: the belief before the records.
+        initial_belief: the belief that the search starts from.
 
     Returns:
-        Mean (K,) and covariance (K, K); those of ``initial_belief`` where the search leads nowhere.
+        Mean (K,) and covariance (K, K); the moments of ``initial_belief`` where the search fails.
     """
     start, cov = initial_belief.coefficients_mean, initial_belief.coefficients_cov
     u = tuple(inputs / initial_belief.scales.input for inputs, _ in records)

@@ -1,12 +1,13 @@
-"""Ridges: where a posterior is no Gaussian, all that the records allow, found by going there.
+"""Profile likelihood: posteriors that are no Gaussian, followed along their ridges.
 
-One settled sine, for example, leaves a line in the space of the coefficients open, over decades: along it all of them
-can change together. No Gaussian about one of its points says so, and its curvature there is mostly that of the noise.
-So the posterior is walked along each parameter, step by step, with all else refitted, the ratio of the noises too,
-until the records object; and leapt along, straight on, to places that a walk does not reach. Every place that was found
-is a Gaussian across the ridge, and all of them are a mixture, weighed by their likelihood and by the distance to their
-neighbours in the parameter's logarithm: which coefficients a model is written in does not matter. Where two steps
-outward cost what a Gaussian promises, and no leap is worth as much as the start, nothing is changed.
+One settled sine, for example, leaves a line in the space of the coefficients open, over decades: all coefficients can
+change together along it. No Gaussian about one of its points describes it, and the curvature there is mostly due to the
+noise. Therefore the posterior is walked along each parameter, step by step, with all other coefficients and the noise
+ratio refitted, until the likelihood falls (`estimator.identification.fitting.ridge_walk`). Leaps straight ahead look
+for modes that a walk does not reach (`estimator.identification.fitting.ridge_leaps`). Each fit on the way is a Gaussian
+across the ridge. The posterior is their mixture, weighted by the likelihood and by the distance to the neighbours in
+the logarithm of the parameter, so that the choice of coefficients does not matter. Where two steps outward cost what a
+Gaussian predicts, and no leap is as probable as the start, the Gaussian remains.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from estimator.identification.likelihood.fit_hypothesis import LaplaceFits
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.support.array_types import FloatArray
 
-#: A ridge of so much of the longest one's extent counts for all parameters.
+#: Extent of a ridge that counts for all parameters, relative to the longest ridge, at least.
 _MIN_RELATIVE_EXTENT = 0.3
 
-#: By how much the noise makes the best place of a ridge better than the true one, about [nats]: half a nat for each
-#: coefficient, of which there are six or so.
+#: Loss by which the noise makes the best point of a ridge better than the true one, about [nats]: half a nat for each
+#: coefficient, without the one along the ridge.
 _NOISE_LOSS_ALLOWANCE = 2.5
 
 #: Probability of a place of a ridge that is left out.
@@ -47,13 +48,13 @@ def profile_posterior(
     """The posterior along the ridges of some parameters; None where it is one Gaussian.
 
     Args:
-        fits: of hypotheses about the noises.
-        best_index: the number of the best.
-        fitter: that made them.
-        names: of parameters of the rig's model.
+        fits: fits at several noise ratios.
+        best_index: index of the best.
+        fitter: the fitter that made them.
+        names: parameters of the rig's model.
 
     Returns:
-        Fits along the ridge that changes most, their probabilities, and what is left of the parameters.
+        Fits along the longest ridge, their probabilities, and the marginals of the parameters.
     """
     parameter_map = ParameterMap(fitter.problem)
     parameter_indices = np.array([list(parameter_map.model.physical).index(name) for name in names])
@@ -93,14 +94,14 @@ def profile_posterior(
 
 @dataclass(frozen=True, eq=False)
 class _ParameterRidge:
-    """What is known along the walks and leaps of one parameter, in the order of its values.
+    """The fits along the walks and leaps of one parameter, in the order of its values.
 
     Attributes:
-        fits: n of them.
+        fits: the n fits.
         weights: (n,) their probabilities.
         values: (n, P) all parameters.
-        stds: (n, P) what is left of them across the ridge, and between its neighbours.
-        extent: by how much parameters change along it, in their logarithms.
+        stds: (n, P) standard deviations across the ridge and between neighbours.
+        extent: change of the parameters along the ridge, in their logarithms.
     """
 
     fits: LaplaceFits
@@ -117,15 +118,22 @@ class _ParameterRidge:
         parameter_indices: npt.NDArray[np.intp],
         fits: LaplaceFits,
     ) -> _ParameterRidge:
-        """That of a parameter, one of several."""
+        """The ridge of one parameter.
+
+        Args:
+            parameter_map: from coefficients to parameters.
+            parameter_index: index of the parameter.
+            parameter_indices: indices of all parameters with ridges.
+            fits: the fits along it, in any order.
+        """
         fits = fits.select(np.argsort(parameter_map.values(fits.mean)[:, parameter_index], kind="stable"))
         values, slopes = parameter_map.values(fits.mean), parameter_map.slopes(fits.mean)
         cov = slopes @ fits.cov @ np.swapaxes(slopes, 1, 2)
         own_variance = cov[:, parameter_index, parameter_index]
         across = np.einsum("npp->np", cov) - cov[:, :, parameter_index] ** 2 / own_variance[:, None]
-        # Before the records a parameter is anywhere within a standard deviation of 0, and in its logarithm beyond.
+        # The prior of a parameter is flat within a standard deviation of 0, and flat in the logarithm beyond.
         places = np.arcsinh(values / np.sqrt(np.einsum("pp->p", cov[np.argmin(fits.loss)])))
-        # Along a ridge the noise makes some places better than others: as much speaks against none.
+        # Along a ridge the noise alone makes some points better than others: this much does not count.
         excess_loss = np.maximum(fits.loss - fits.loss.min() - _NOISE_LOSS_ALLOWANCE, 0.0)
         spacing = np.exp(-excess_loss)[:, None] * sum(_neighbour_distances(places)) / 2
         weights = spacing[:, parameter_index]
@@ -135,6 +143,6 @@ class _ParameterRidge:
 
 
 def _neighbour_distances(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances to the neighbours before and after, along the first axis; 0 where there is none."""
+    """Distances to the previous and the next position along the first axis; 0 at the ends."""
     gaps = np.abs(np.diff(positions, axis=0, prepend=positions[:1], append=positions[-1:]))
     return gaps[:-1], gaps[1:]

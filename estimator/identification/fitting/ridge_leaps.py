@@ -1,4 +1,4 @@
-"""Leaps along a parameter to places of the posterior that a walk does not reach."""
+"""Leaps along a parameter to modes of the posterior that a walk does not reach."""
 
 from __future__ import annotations
 
@@ -49,9 +49,18 @@ _SURPRISING_LOSS_FRACTION = 0.5
 def fit_leaps(
     fitter: LaplaceFitter, parameter_map: ParameterMap, start: LaplaceFits, parameter_indices: npt.NDArray[np.intp]
 ) -> tuple[dict[int, LaplaceFits], bool]:
-    """Parameter to fits straight on from the start that are worth about as much, and whether a Gaussian has none there.
+    """Fits far from the start, straight along each parameter, that are about as probable as the start.
 
-    They are tried with fewer noises first, and in a few steps: most are hopeless.
+    All leaps are screened first, at one noise ratio and in a few steps, because most fail.
+
+    Args:
+        fitter: fitter of the records.
+        parameter_map: from coefficients to parameters.
+        start: the fit to leap from.
+        parameter_indices: indices of the parameters to leap along.
+
+    Returns:
+        Index of a parameter to its fits, and whether they contradict a Gaussian about the start.
     """
     begin, values, slopes = start.mean[0], parameter_map.values(start.mean)[0], parameter_map.slopes(start.mean)[0]
     leaps = list[tuple[int, float, FloatArray]]()
@@ -82,19 +91,16 @@ def fit_leaps(
         found = fits.select(np.arange(count) * n + finite_losses(fits).reshape(count, n).argmin(axis=1))
         kept = finite_losses(found) < start.loss[0] + allowed
         found = found.select(kept)
-        points, gradients, leap_parameters, lengths = (
-            points[kept],
-            gradients[kept],
-            leap_parameters[kept],
-            lengths[kept],
-        )
+        points, gradients = points[kept], gradients[kept]
+        leap_parameters, lengths = leap_parameters[kept], lengths[kept]
         if not len(points):
             return {}, False
-    promised = np.where(lengths > _SURPRISING_LEAP_STDS, 0.5 * lengths**2, 0.0)
-    is_surprising = bool((found.loss - start.loss[0] < _SURPRISING_LOSS_FRACTION * promised).any())
-    return {
+    predicted = np.where(lengths > _SURPRISING_LEAP_STDS, 0.5 * lengths**2, 0.0)
+    is_surprising = bool((found.loss - start.loss[0] < _SURPRISING_LOSS_FRACTION * predicted).any())
+    fits_by_parameter = {
         number: found.select(leap_parameters == number) for number in np.unique(leap_parameters).tolist()
-    }, is_surprising
+    }
+    return fits_by_parameter, is_surprising
 
 
 def _length_to_target(
@@ -105,7 +111,16 @@ def _length_to_target(
     sign: float,
     target: float,
 ) -> float:
-    """How far along a direction a parameter is at a target, or as near as it comes before it jumps."""
+    """The length along a direction at which a parameter reaches a target, or the last before the parameter jumps.
+
+    Args:
+        parameter_map: from coefficients to parameters.
+        parameter_index: index of the parameter.
+        begin: (K,) coefficients at length 0.
+        direction_vector: (K,) change of the coefficients per length.
+        sign: 1 where the target is above the begin, -1 where below.
+        target: value of the parameter.
+    """
     first = float(parameter_map.values(begin[None])[0, parameter_index])
 
     def is_past(length: float) -> bool:

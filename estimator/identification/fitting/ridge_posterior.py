@@ -1,4 +1,4 @@
-"""`RidgePosterior`: mixtures of Gaussians along the ridges of a posterior, and their intervals."""
+"""`RidgePosterior`: marginals and credible intervals along the ridges of a posterior, as mixtures of Gaussians."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 from estimator.support.array_types import FloatArray
 
-#: Probability of a standard deviation either way.
+#: Probability within one standard deviation of a Gaussian's mean.
 ONE_STD_PROBABILITY = 0.6826894921370859
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureMarginal:
-    """What is left of a parameter: a mixture of Gaussians along a ridge.
+    """The marginal of a parameter: a mixture of Gaussians along a ridge.
 
     Attributes:
-        mean: (n,) of each, in the rig's units.
-        std: (n,)
-        weights: (n,) their probabilities.
+        mean: (n,) means, in the rig's units.
+        std: (n,) standard deviations.
+        weights: (n,) probabilities.
     """
 
     mean: FloatArray
@@ -25,7 +25,7 @@ class MixtureMarginal:
     weights: FloatArray
 
     def quantile(self, probability: float) -> float:
-        """What the parameter is below with a probability."""
+        """The value below which the parameter lies with a probability."""
         from scipy.special import ndtr
 
         low, high = float((self.mean - 9 * self.std).min()), float((self.mean + 9 * self.std).max())
@@ -40,18 +40,18 @@ class MixtureMarginal:
 
 @dataclass(frozen=True, eq=False)
 class RidgePosterior:
-    """A posterior that is no Gaussian, as several walks along it see it.
+    """A posterior along several ridges.
 
     Attributes:
-        marginals: parameter to what each walk left of it.
-        median_index: number of the hypothesis in the middle.
+        marginals: parameter to its marginal along each ridge.
+        median_index: index of the median fit.
     """
 
     marginals: dict[str, list[MixtureMarginal]]
     median_index: int
 
     def interval(self, probability: float) -> dict[str, tuple[float, float]]:
-        """Parameter to the widest of the central intervals: a walk misses what lies beside it, and none adds."""
+        """Parameter to its widest interval over the ridges: a ridge may miss values, but adds no impossible ones."""
         below = 0.5 - probability / 2
         return {
             name: (min(one.quantile(below) for one in several), max(one.quantile(1 - below) for one in several))
@@ -59,5 +59,5 @@ class RidgePosterior:
         }
 
     def half_widths(self) -> dict[str, float]:
-        """Parameter to half of the interval that would be a standard deviation either way of a Gaussian."""
+        """Parameter to half of its 68 % interval, which is the standard deviation of a Gaussian."""
         return {name: (high - low) / 2 for name, (low, high) in self.interval(ONE_STD_PROBABILITY).items()}

@@ -1,4 +1,4 @@
-"""Walks along a ridge of the posterior, outward along each parameter with all others refitted."""
+"""Walks along the ridge of a posterior: outward along each parameter, with all other coefficients refitted."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _STEP_GROWTH = 1.7
 #: Factor of a repeated step.
 _STEP_SHRINKAGE = 0.4
 
-#: Ratios of the noises that are tried beside that of the step before, as factors.
+#: Factors of the noise ratio that are tried at each step.
 _WALK_RATIO_FACTORS = (0.2, 1.0, 5.0)
 
 #: Steps of a fit in the Gaussian check and in the screening of leaps.
@@ -61,7 +61,7 @@ _MIN_STEP_STDS = 0.02
 
 
 class ParameterMap:
-    """From the coefficients of a fit to the parameters of the rig's model, in the rig's units."""
+    """The map from the coefficients of a fit to the parameters of the rig's model, in the rig's units."""
 
     def __init__(self, problem: IdentificationProblem) -> None:
         self.model, self.scales, k = problem.rig.model, problem.scales, problem.model.n_coefficients
@@ -76,19 +76,21 @@ class ParameterMap:
         return to_physical(self.model, points @ self._rotation.T + self._offset, self.scales)
 
     def slopes(self, points: FloatArray) -> FloatArray:
-        """(n, P, K) of the parameters by the coefficients."""
+        """(n, P, K) derivatives of the parameters by the coefficients."""
         return physical_jacobian(self.model, points @ self._rotation.T + self._offset, self.scales) @ self._rotation
 
 
 @dataclass
 class RidgeWalk:
-    """Walks outward along W parameters side by side.
+    """W walks outward, each along a parameter.
 
     Attributes:
-        parameter_index: (W,) the parameter of each, by number.
+        fitter: fitter of the records.
+        parameter_map: from coefficients to parameters.
+        parameter_index: (W,) index of the parameter of each walk.
         direction: (W,) 1 or -1.
-        current: what each has reached.
-        step_length: (W,) of the next step, in standard deviations there.
+        current: the fit that each walk has reached.
+        step_length: (W,) length of the next step, in standard deviations at the current fit.
     """
 
     fitter: LaplaceFitter
@@ -99,7 +101,7 @@ class RidgeWalk:
     step_length: FloatArray
 
     def predict_step(self, walks: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """Of some walks: (n, K) where the next step leads if all is Gaussian, and (n, K) the parameter's slopes."""
+        """The next coefficients (n, K) of some walks by the Gaussian, and the gradients (n, K) of their parameters."""
         points, which, side = self.current.mean[walks], self.parameter_index[walks], self.direction[walks]
         rows = np.arange(len(walks))
         slopes = self.parameter_map.slopes(points)[rows, which]
@@ -109,7 +111,7 @@ class RidgeWalk:
         now = self.parameter_map.values(points)[rows, which]
         for _ in range(_MAX_HALVINGS):
             ahead = points + self.step_length[walks, None] * unit
-            # A parameter that is a quotient jumps where what it is divided by changes its sign.
+            # A parameter that is a quotient jumps where its denominator changes sign.
             change = side * (self.parameter_map.values(ahead)[rows, which] - now)
             jumps = ~(change > 0)
             if not jumps.any():
@@ -118,7 +120,7 @@ class RidgeWalk:
         return ahead, slopes
 
     def fit_step(self, walks: npt.NDArray[np.intp], ratio_factors: Sequence[float], iterations: int) -> LaplaceFits:
-        """Of some walks the best fits where the next step leads, with the noises in the best of some ratios."""
+        """The fits of some walks after the next step, each at the best of several noise ratios."""
         ahead, slopes = self.predict_step(walks)
         n = len(ratio_factors)
         hypotheses = [
@@ -133,7 +135,7 @@ class RidgeWalk:
         return fits.select(np.arange(len(walks)) * n + finite_losses(fits).reshape(-1, n).argmin(axis=1))
 
     def walk_outward(self, lowest_loss: float) -> tuple[LaplaceFits, npt.NDArray[np.intp]]:
-        """Go until the records lose enough; all that was fitted on the way, and the number of the walk of each."""
+        """Walk until the loss is large; all fits on the way, and the index of the walk of each."""
         self.step_length[:] = 1.0
         rows = np.arange(len(self.parameter_index))
         first = self.parameter_map.values(self.current.mean)[rows, self.parameter_index]
@@ -167,12 +169,12 @@ class RidgeWalk:
 
 
 def finite_losses(fits: LaplaceFits) -> FloatArray:
-    """(H,) losses; inf where a fit ran away."""
+    """(H,) losses; inf where a fit diverged."""
     return np.where(np.isfinite(fits.free_energy), fits.loss, np.inf)
 
 
 def is_gaussian(walk: RidgeWalk, found: LaplaceFits) -> bool:
-    """Whether what the records lose is what a Gaussian says."""
+    """Whether the loss of the found fits agrees with a Gaussian about the current fits of a walk."""
     rows = np.arange(len(walk.parameter_index))
     now, there = (walk.parameter_map.values(fits.mean)[rows, walk.parameter_index] for fits in (walk.current, found))
     slopes = walk.parameter_map.slopes(walk.current.mean)[rows, walk.parameter_index]

@@ -1,4 +1,4 @@
-"""`SearchResult`: fits about the noises, their probabilities, and the moments of their mixture."""
+"""`SearchResult`: fits at several noise ratios, their probabilities, and the moments of their mixture."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from estimator.support.array_types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search left.
+    """The result of a search.
 
     Attributes:
-        fits: hypotheses about the noises that share the records, interpolation, delay and terms.
+        fits: fits at H noise ratios, with the same records, interpolation, delay and terms.
         weights: (H,) their probabilities.
-        fitter: that made them.
-        has_failed: whether they explain the records badly, and no other start leads to them.
-        ridges: along which the posterior lies where it is no Gaussian; the hypotheses are then also about the
-            coefficients.
+        fitter: the fitter that made them.
+        has_failed: whether the fit is poor and no other start leads to it.
+        ridges: ridges of a posterior that is no Gaussian, along which the fits then lie; None of a Gaussian.
     """
 
     fits: LaplaceFits
@@ -37,29 +36,29 @@ class SearchResult:
 
     @property
     def mean(self) -> FloatArray:
-        """(K,) of the mixture; along a ridge its middle, because a mean may be beside all that is possible."""
+        """(K,) mean of the mixture; along a ridge its median, because the mean may lie off the ridge."""
         return np.asarray(self.weights @ self.fits.mean) if self.ridges is None else self.fits.mean[self._best_index]
 
     @property
     def cov(self) -> FloatArray:
-        """(K, K) of the mixture, about `mean`."""
+        """(K, K) covariance of the mixture, about `mean`."""
         away = self.fits.mean - self.mean
         return np.asarray(np.tensordot(self.weights, self.fits.cov, 1) + (away.T * self.weights) @ away)
 
     @property
     def best(self) -> FitHypothesis:
-        """The most probable hypothesis; along a ridge that in the middle."""
+        """The most probable hypothesis; along a ridge the median one."""
         return self.fits.hypotheses[self._best_index]
 
     @property
     def initial_states(self) -> FloatArray:
-        """(records, 2) displacement and velocity a sample before each record."""
+        """(records, 2) displacement and velocity one sample before each record."""
         assert self.best.initial_states is not None
         return self.best.initial_states
 
     @property
     def sensor_std(self) -> float:
-        """σ_v of that hypothesis."""
+        """σ_v of `best`."""
         return float(self.fits.sensor_std[self._best_index])
 
     @property
@@ -68,7 +67,7 @@ class SearchResult:
 
     @property
     def relative_disturbance(self) -> float:
-        """σ_w of the most probable hypothesis, in parts of what the inputs do."""
+        """σ_w of `best`, relative to the effect of the inputs."""
         return self.best.noise_ratio * self.sensor_std / max(input_effect_rms(self.fitter.problem, self.mean), 1e-300)
 
     @property

@@ -1,4 +1,4 @@
-"""Starting points of the search: weak-form starts, random starts, and fits from each."""
+"""Starting points of the search: fits from weak-form starts, from a guess, and from random starts."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
-#: Where the search for the noises begins: σ_w/σ_v in parts of the squared angular frequency, which is what moves the
-#: output as much as it disturbs it. It is open to either side.
+#: Noise ratios σ_w/σ_v of the first fits, in units of the squared angular frequency, at which process noise and sensor
+#: noise have the same effect on the output. Later grids may go beyond.
 _INITIAL_NOISE_RATIOS = np.geomspace(1e-2, 1e2, 5)
 
 #: Periods of each record in the first fits.
@@ -30,10 +30,10 @@ _MIN_FIRST_SAMPLES = 1024
 #: Most samples of each record in the first fits.
 _MAX_FIRST_SAMPLES = 4096
 
-#: The equation is tested with so many periods, where these are more samples.
+#: Periods of each record in the weak form, at least.
 _WEAK_FORM_PERIODS = 40
 
-#: Steps of it, after which so many of its hypotheses are kept.
+#: Stages of the first fits: steps, and number of fits that are kept.
 _FIRST_SEARCH_STAGES = ((3, 8), (10, 1))
 
 #: Random starts in a round.
@@ -54,12 +54,12 @@ _RESTART_FIT_STEPS = 8
 #: Results that are kept of random starts, of segments, and of all records.
 _N_KEPT_STARTS = (48, 12, 3)
 
-#: Steps of a fit to all records, from what the first look found and from where it began, of which the best is kept.
+#: Steps of the fits to all records that confirm a start.
 _CONFIRMING_FIT_STEPS = 3
 
 
 def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
-    """The best of all starts and ratios of the noises; of none where all ran away."""
+    """The best fit over all starts and noise ratios; no fit where all diverge."""
     problem = fitter.problem
     period = 2 * np.pi / problem.mean_frequency
     samples = int(np.clip(_FIRST_PERIODS * period, _MIN_FIRST_SAMPLES, _MAX_FIRST_SAMPLES))
@@ -85,7 +85,7 @@ def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
         fits = short_fitter.fit(hypotheses, points, sensor_std, steps).lowest_free_energy(kept)
         hypotheses, points, sensor_std = list(fits.hypotheses), fits.mean, fits.sensor_std
     if short_fitter.problem.n_observed_outputs < problem.n_observed_outputs and np.isfinite(fits.free_energy).any():
-        # The first periods may tell little of a coefficient, which then is anywhere: all records judge.
+        # The first periods may leave a coefficient open: all records decide.
         points = np.array([*fits.mean, *candidates])
         fits = fitter.fit(
             list(fits.hypotheses) * len(points), points, fits.sensor_std[0], _CONFIRMING_FIT_STEPS
@@ -94,7 +94,7 @@ def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
 
 
 def fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
-    """The best that many starts lead to, which are drawn and fitted to pieces of the records that grow."""
+    """The best fits from random starts, fitted to growing segments of the records."""
     problem = fitter.problem
     ratios = _INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order)
     base = FitHypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[2]), lag=problem.lag)
@@ -122,7 +122,7 @@ def fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
 
 
 def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: FloatArray, n_kept: int) -> LaplaceFits:
-    """The best of fits from where others came to, of records that begin in motion, each at the best of the ratios."""
+    """The best ``n_kept`` of further fits from earlier ones, with new initial states and the best of several ratios."""
     if not len(fits.mean):
         return fits
     base = replace(fits.hypotheses[0], initial_states=None)
@@ -137,6 +137,6 @@ def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: F
 
 
 def _distinct_optima(fits: LaplaceFits, max_count: int) -> LaplaceFits:
-    """The best of those that did not come to the same."""
+    """The best ``max_count`` fits with different optima."""
     finite = fits.select(np.isfinite(fits.free_energy))
     return finite.select(np.unique(np.round(finite.free_energy), return_index=True)[1][:max_count])

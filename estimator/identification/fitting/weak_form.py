@@ -1,12 +1,12 @@
-"""Where a search begins, when nothing is guessed: the equation, tested with smooth bumps.
+"""Weak-form identification (Messenger and Bortz 2021): starting coefficients without a guess, by least squares.
 
-Integrated against a bump φ that vanishes with its derivatives at both ends, x'' becomes ∫φ'' x: no derivative of a
-noisy record is taken. What is left is linear in the coefficients,
+A test function φ is a smooth bump that vanishes with its derivatives at both ends. Integrated against it, x'' becomes
+∫φ'' x, so that no noisy record is differentiated. The result is linear in the coefficients,
 
     ∫φ'' x = gain ∫φ u - damping ∫φ v - stiffness ∫φ x - cubic ∫φ x³ + force ∫φ,
 
-an equation for each place of the bump, solved by least squares. Narrow bumps are noisy, wide ones forget the fast part
-of the motion, so several widths are tried (Messenger and Bortz 2021 name this weak-form identification).
+one equation for each position of the bump, solved by least squares. Narrow bumps are noisy, wide bumps lose the fast
+part of the motion, so several widths are tried.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from estimator.identification.likelihood.problem_signals import interpolate_gaps
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.support.array_types import FloatArray
 
-#: Half widths of the bumps, in parts of the period of the mean frequency.
+#: Half widths of the test functions, in periods of the mean frequency.
 _TEST_FUNCTION_WIDTHS = (0.12, 0.25, 0.5, 1.0)
 
-#: (1 - s²)^n has n - 1 derivatives that vanish at the ends.
+#: Power n of the test function (1 - s²)^n, of which n - 1 derivatives vanish at the ends.
 _TEST_FUNCTION_POWER = 6
 
-#: A gap of so many periods is bridged: what comes of it is a start, and no more.
+#: Longest gap that is bridged, in periods: enough for a start.
 _MAX_BRIDGED_PERIODS = 1 / 6
 
-#: Periods over which an integrated signal loses its drift.
+#: Periods of the high-pass that removes the drift of an integrated signal.
 _HIGH_PASS_PERIODS = (3.0, 10.0, 30.0)
 
 #: Resting samples at the start of a record that begins at rest, at least.
@@ -48,22 +48,22 @@ _MIN_RANDOM_SIZE = 0.003
 #: Largest random coefficient, in natural sizes.
 _MAX_RANDOM_SIZE = 2.0
 
-#: Coefficients that are drawn; the others begin at 0.
+#: Coefficients with random starts; the others start at 0.
 _RANDOM_COEFFICIENTS = ("gain", "damping", "stiffness", "cubic")
 
 
 def _whole_delay_inputs(problem: IdentificationProblem) -> FloatArray:
-    """(T, rows) inputs with the nearest whole delay: only what is held may act a whole sample early."""
+    """(T, rows) inputs with the nearest integer delay; only a held input may act a whole sample early."""
     rig = problem.rig
     least = -1 if rig.interpolation == "zero_order" else 0
     return problem.filter_samples(rig.interpolation, max(round(rig.delay), least)).inputs
 
 
 def weak_form_starts(problem: IdentificationProblem) -> list[FloatArray]:
-    """Coefficients (K,) to begin with: one set for each width of the bumps, and each way to lose the drift.
+    """Starting coefficients (K,), one set for each width of the test functions and each high-pass.
 
-    Where outputs are counted from an origin, also one for each place that may be the spring's middle: the origin, 0,
-    and the rig's offset. None where the records are too short.
+    Where the outputs have an origin, there is also one set for each possible inflection of the spring: the origin, 0,
+    and the rig's offset. The list is empty where the records are too short.
     """
     names = list(problem.model.coefficients)
     problem = problem.resampled_evenly()
@@ -91,7 +91,7 @@ def weak_form_starts(problem: IdentificationProblem) -> list[FloatArray]:
         gain, damping, stiffness, cubic, force, square = solution
         gain = 1.0 if problem.is_free_decay else gain
         values = dict.fromkeys(names, 0.0) | {"gain": gain, "damping": damping, "cubic": cubic, "force": force}
-        # An integrated signal may be displaced: stiffness x + square x² + cubic x³ is a cubic about another middle.
+        # An integrated signal may be shifted: stiffness x + square x² + cubic x³ is a cubic about another inflection.
         centre_shift = square / (3 * cubic) if abs(cubic) > 0 else 0.0
         is_near = abs(centre_shift) < 3 * problem.displacement and integrates
         values["stiffness"] = stiffness - (3 * cubic * centre_shift**2 if is_near else 0.0)
@@ -103,15 +103,17 @@ def weak_form_starts(problem: IdentificationProblem) -> list[FloatArray]:
 
 
 def random_starts(problem: IdentificationProblem, count: int, seed: int) -> list[FloatArray]:
-    """Coefficients (K,) of all sizes and signs, the same for a seed: to begin with where `weak_form_starts` lead nowhere.
+    """Random starting coefficients (K,) of all sizes and signs, for records at which `weak_form_starts` fail.
 
-    A spring that pushes away from its middle hardens, because nothing would hold the oscillator else.
+    A spring with negative stiffness hardens, because nothing else would hold the oscillator.
+
+    Args:
+        problem: the records.
+        count: number of sets.
+        seed: of the random numbers.
     """
-    names, natural, rng = (
-        list(problem.model.coefficients),
-        problem.natural_coefficient_sizes(),
-        np.random.default_rng(seed),
-    )
+    names, natural = list(problem.model.coefficients), problem.natural_coefficient_sizes()
+    rng = np.random.default_rng(seed)
     coefficient_sets = []
     for offset in np.resize(_spring_centres(problem), count):
         sizes = {
@@ -129,12 +131,12 @@ def random_starts(problem: IdentificationProblem, count: int, seed: int) -> list
 
 
 def input_effect_rms(problem: IdentificationProblem, coefficients: FloatArray) -> float:
-    """Root mean square of what the inputs do to the motion at coefficients (K,), in the unit of the process noise."""
+    """Root mean square effect of the inputs on the motion at coefficients (K,), in the unit of the process noise."""
     return abs(float(coefficients[list(problem.model.coefficients).index("gain")])) * problem.input_rms
 
 
 def _spring_centres(problem: IdentificationProblem) -> list[float]:
-    """Places, counted as the outputs are, where the spring may be without force; just 0 where these have no origin."""
+    """Possible inflections of the spring, from the origin of the outputs; 0 alone where they have no origin."""
     if not problem.origin:
         return [0.0]
     stated_offset = problem.rig.output.offset / problem.scales.output
@@ -142,10 +144,13 @@ def _spring_centres(problem: IdentificationProblem) -> list[float]:
 
 
 def delay_misfits(problem: IdentificationProblem, delays: NDArray[np.intp]) -> FloatArray:
-    """What the equation leaves of the acceleration at best, in parts of it, over bumps of some widths.
+    """Relative residuals of the weak-form acceleration for each delay, the lowest over several widths.
 
-    For every one of some delays by which the input acts later, or earlier where they are negative. Only the input's
-    column depends on the delay, so the others are projected out of it and of the acceleration once.
+    Only the input's column depends on the delay; the other columns are projected out once.
+
+    Args:
+        problem: the records, at even steps.
+        delays: delays of the input beyond the rig's [samples]; negative where the input acts earlier.
     """
     inputs, longest = _whole_delay_inputs(problem), int(np.abs(delays).max())
     periods = _HIGH_PASS_PERIODS[1] if DERIVATIVE_ORDER_OF_SENSOR[problem.rig.output.kind] > 0 else 0.0
@@ -179,13 +184,13 @@ def delay_misfits(problem: IdentificationProblem, delays: NDArray[np.intp]) -> F
 
 
 class _WeakFormEquations(NamedTuple):
-    """Equations integrated against bumps.
+    """Weak-form equations of a record.
 
     Attributes:
-        rows: (n, 7) columns x'', u, -x', -x, -x³, 1 and -x².
-        is_clean: (n,) which rows hold no gap and no drift.
-        input_at_outputs: (T,) the input that acts at every output.
-        test_function: (w,) what they are integrated against.
+        rows: (n, 7) columns x'', u, -x', -x, -x³, 1 and -x², integrated against the test function.
+        is_clean: (n,) whether a row holds no gap and no drift.
+        input_at_outputs: (T,) input that acts at every output.
+        test_function: (w,) samples of the test function.
         stride: samples between two rows.
     """
 
@@ -199,7 +204,7 @@ class _WeakFormEquations(NamedTuple):
 def _clean_equations(
     problem: IdentificationProblem, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
 ) -> FloatArray | None:
-    """(n, 7) the rows of `_WeakFormEquations` that are clean; None for a record that is too short."""
+    """(n, 7) the clean rows of `_WeakFormEquations`; None for a record that is too short."""
     found = _weak_form_equations(problem, inputs, y, half_width, high_pass_periods)
     return None if found is None else found.rows[found.is_clean]
 
@@ -207,7 +212,7 @@ def _clean_equations(
 def _weak_form_equations(
     problem: IdentificationProblem, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
 ) -> _WeakFormEquations | None:
-    """The equations of a record; None for one that is too short."""
+    """The weak-form equations of a record; None for a record that is too short."""
     count = len(y)
     if count < 4 * half_width:
         return None
@@ -228,7 +233,7 @@ def _weak_form_equations(
     shown, x = bridged_output, bridged_output
     for _ in range(order):
         x = _integrate_high_passed(x, problem.mean_frequency / high_pass_periods)
-    # The input's mean over the sample before each output belongs to the middle of that sample.
+    # The mean of the input over the sample before each output belongs to the middle of that sample.
     powers = np.arange(inputs.shape[1])
     mean = np.nan_to_num(inputs[:count]) @ (1.0 / (1 + powers))
     acting = 0.5 * (mean + np.append(mean[1:], mean[-1]))
@@ -252,7 +257,7 @@ def _weak_form_equations(
 
 
 def _begins_at_rest(u: FloatArray, y: FloatArray) -> bool:
-    """Whether a record begins at rest, before anything acts: then an integrated signal has no drift to lose."""
+    """Whether a record begins at rest before the input acts, so that an integrated signal has no drift."""
     onset = int(np.argmax(np.abs(u - u[0]) > _RESTING_FRACTION * np.abs(u).max()))
     return onset >= _MIN_RESTING_SAMPLES and float(np.sqrt(np.mean(y[:onset] ** 2))) < _RESTING_FRACTION * float(
         y.std()
@@ -260,7 +265,7 @@ def _begins_at_rest(u: FloatArray, y: FloatArray) -> bool:
 
 
 def _integrate_high_passed(values: FloatArray, corner_frequency: float) -> FloatArray:
-    """The integral by the sample, without what is slower than an angular frequency."""
+    """The integral over samples, high-passed at an angular frequency [rad per sample]."""
     from scipy.signal import butter, sosfiltfilt
 
     total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]))])

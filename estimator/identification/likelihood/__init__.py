@@ -1,1 +1,1 @@
-"""The likelihood of records under a model, and its initial states."""
+"""The likelihood of records under a model, its most probable coefficients, and the initial states of the records."""

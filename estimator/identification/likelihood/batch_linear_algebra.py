@@ -1,4 +1,4 @@
-"""Linear solves and inverses of batches of matrices, of which some may be singular."""
+"""Solutions and inverses of batches of symmetric matrices, some of which may be singular."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from estimator.support.array_types import FloatArray
 
 
 def _with_unit_diagonal(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Matrices with 1 on their diagonals, and the roots of those that they had."""
+    """Matrices scaled to unit diagonals, and the roots of their diagonals."""
     root = np.sqrt(np.einsum("hii->hi", matrices))
     return matrices / (root[:, :, None] * root[:, None, :]), root
 
 
 def solve_batch(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(H, K) solutions; zeros where a matrix is singular."""
+    """(H, K) solutions of linear equations; zeros where a matrix is singular."""
     unit, root = _with_unit_diagonal(matrices)
     return _solve_each_if_singular(np.linalg.solve, 0.0, unit, (vectors / root)[:, :, None])[:, :, 0] / root
 
 
 def solve_with_fixed_directions(matrices: FloatArray, vectors: FloatArray, directions: FloatArray) -> FloatArray:
-    """(H, K) solutions in the planes that are at right angles to the pins (H, K)."""
+    """(H, K) solutions restricted to the planes orthogonal to the directions (H, K)."""
     unit, root = _with_unit_diagonal(matrices)
     plane = np.linalg.qr((directions / root)[:, :, None], mode="complete")[0][:, :, 1:]
     transposed = np.swapaxes(plane, 1, 2)
@@ -38,7 +38,7 @@ def invert_batch(matrices: FloatArray) -> FloatArray:
 
 
 def _solve_each_if_singular(solve: Callable[..., FloatArray], fallback: float, *stacks: FloatArray) -> FloatArray:
-    """What ``solve`` makes of stacks: of all at once, or where a matrix is singular, of each; ``fallback`` for that one."""
+    """Results of ``solve`` for all matrices at once, or one by one with ``fallback`` for each singular matrix."""
     try:
         return np.asarray(solve(*stacks))
     except np.linalg.LinAlgError:

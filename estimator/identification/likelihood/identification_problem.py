@@ -1,11 +1,11 @@
-"""The records of an identification, as the engine takes them: scaled, with all ways that the input may have gone."""
+"""`IdentificationProblem`: scaled records, and their samples for the filter under a hypothesis of the input path."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,19 +26,19 @@ from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
 
-#: Samples by which the input may be later than the rig says: a check looks for it.
+#: Samples by which the input may be later than the rig says, within the reach of a check.
 MAX_UNSTATED_DELAY = 3
 
-#: Parameters that an identification is for; the others are what a channel adds.
+#: Parameters of Eq. (1); the others are offsets of the channels.
 TARGET_PARAMETERS = tuple(PARAMETER_DIMENSIONS)
 
-#: Terms that an equation may have beside those of Eq. (1) and the offsets: checks look for them.
+#: Terms beyond Eq. (1) and the offsets, for which a check tests the records.
 OPTIONAL_TERMS = ("cubic_damping", "quintic", "dry_friction")
 
-#: Speed below which dry friction fades, in parts of the usual one.
+#: Speed below which dry friction fades, relative to the usual speed.
 _CREEP_SPEED_FRACTION = 0.05
 
-#: Samples of a gap that is bridged before it is known how long a period is.
+#: Longest gap that is bridged before the period is known [samples].
 _MAX_BRIDGED_GAP = 16
 
 #: Power of a weakly driven segment, as a fraction of the strongest, at most.
@@ -48,14 +48,26 @@ _WEAK_INPUT_POWER = 0.25
 _STRONG_INPUT_POWER = 0.98
 
 
-class FilterSamples(NamedTuple):
-    """Records as a filter takes them; a shorter one ends with NaN.
+class Segment(NamedTuple):
+    """A segment of a record.
 
     Attributes:
-        inputs: (records, N, rows) what acts over each sample.
-        outputs: (records, N, 1) at its end.
+        record: number of the record.
+        first_sample: first sample of the segment.
+    """
+
+    record: int
+    first_sample: int
+
+
+class FilterSamples(NamedTuple):
+    """Records as samples of the filter; a shorter record ends with NaN.
+
+    Attributes:
+        inputs: (records, N, rows) input over each sample.
+        outputs: (records, N, 1) output at its end.
         spans: (records, N) its length in sampling steps; None where all are one step.
-        output_indices: of each record, (T,) the sample that ends with each of its outputs.
+        output_indices: per record, (T,) index of the sample that ends with each output.
     """
 
     inputs: FloatArray
@@ -66,18 +78,18 @@ class FilterSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class IdentificationProblem:
-    """Records to identify a rig from.
+    """The records of a rig, scaled, and the equation that they are fitted by.
 
     Attributes:
-        rig: as it was given.
-        scales: that the records are in.
-        u: inputs of each record, in parts of their scale.
-        y: outputs of each record, in parts of theirs, counted from the origin, NaN where one is missing.
-        origin: where outputs are counted from, in parts of their scale: about their middle, where that is far from 0.
-        substeps: steps of integration a sample.
-        optional_terms: of the equation, beside those of Eq. (1) and the offsets; some of `OPTIONAL_TERMS`.
-        times: of the samples of each record, in sampling steps from its first on; None where these are one step apart.
-        record_noise_scales: of each record, the noises in parts of what they are on the whole; None where they are alike.
+        rig: the rig of the records.
+        scales: scales of the records.
+        u: inputs of each record, in units of their scale.
+        y: outputs of each record from the origin, in units of their scale; NaN where one is missing.
+        origin: origin of the outputs, in units of their scale: near their mean, where that is far from 0.
+        substeps: integration steps per sample.
+        optional_terms: terms beyond Eq. (1) and the offsets, from `OPTIONAL_TERMS`.
+        times: times of the samples of each record, in sampling steps from its first; None for even times.
+        record_noise_scales: (records,) noises of each record relative to the noises of all; None where they are equal.
     """
 
     rig: Rig
@@ -92,37 +104,51 @@ class IdentificationProblem:
 
     @cached_property
     def model(self) -> Model:
-        """The rig's own, with the terms."""
-        more: dict[str, Any] = dict.fromkeys(self.optional_terms, True)
-        model = duffing(offsets=True, sensor=self.rig.output.kind, **more)
+        """The rig's model with the optional terms."""
+        terms = {name: name in self.optional_terms for name in OPTIONAL_TERMS}
+        model = duffing(
+            offsets=True,
+            sensor=self.rig.output.kind,
+            cubic_damping=terms["cubic_damping"],
+            quintic=terms["quintic"],
+            dry_friction=terms["dry_friction"],
+        )
         return replace(model, substeps=self.substeps)
 
     @property
     def belief_model(self) -> Model:
-        """The rig's own, of which the belief is; integrated as `model` is, where that is finer."""
-        own = self.rig.model
-        return replace(own, substeps=self.substeps) if self.substeps > own.substeps else own
+        """The rig's model, for the belief; with the substeps of `model`, where these are more."""
+        model = self.rig.model
+        return replace(model, substeps=self.substeps) if self.substeps > model.substeps else model
 
     @property
     def n_observed_outputs(self) -> int:
-        """Outputs that were seen."""
+        """Number of outputs that are not missing."""
         return int(sum(np.isfinite(y).sum() for y in self.y))
 
     @property
     def lag(self) -> float:
-        """Time constant of the input's lag, in sampling steps, as the rig says."""
+        """Time constant of the input's lag that the rig states, in sampling steps."""
         return (self.rig.input.lag or 0.0) / self.rig.step
 
     def noises_of_records(self, noises: FloatArray) -> FloatArray:
-        """(series, 2) variances of both noises in every record, of those on the whole (n, 2): record after record."""
+        """(n · records, 2) variances of both noises in every record, record by record, from those of all (n, 2)."""
         record_scales = np.ones(len(self.u)) if self.record_noise_scales is None else self.record_noise_scales
         return (noises[:, None] * record_scales[:, None] ** 2).reshape(-1, noises.shape[1])
 
     def filter_samples(self, interpolation: str, delay: float, lag: float = 0.0) -> FilterSamples:
-        """The records, if the input went so; every sample is one step long where that is enough."""
+        """The records as samples of the filter, under a hypothesis of the input path.
+
+        Every sample is one step long where the times are even, the delay is an integer and there is no lag.
+
+        Args:
+            interpolation: of the input.
+            delay: of the input [samples].
+            lag: time constant of the input's lag [samples].
+        """
         rows = 1 + max(INTERPOLATION_DEGREES[name] for name in ("linear", self.rig.interpolation, interpolation))
         if self.times is None and delay == int(delay) and not lag:
-            # A record's first output comes before its first input acts, however the input goes.
+            # The first output of a record precedes the effect of its first input, for every input path.
             rig = replace(self.rig, interpolation=interpolation, delay=int(delay), input=Channel())
             inputs = stack_padded([filter_input_rows(self.model, rig, u) for u in self.u], rows)
             places = tuple(np.arange(len(y)) for y in self.y)
@@ -146,7 +172,7 @@ class IdentificationProblem:
         return self.times or tuple(np.arange(len(u), dtype=np.float64) for u in self.u)
 
     def resampled_evenly(self) -> IdentificationProblem:
-        """The same with outputs and inputs in between, one step apart: enough to find a start."""
+        """The same with inputs and outputs interpolated to even steps, which is enough to find a start."""
         if self.times is None:
             return self
         u, y = [], []
@@ -157,23 +183,23 @@ class IdentificationProblem:
         return replace(self, u=tuple(u), y=tuple(y), times=None)
 
     def moments_about_origin(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Moments (K,) and (K, K) of the model's coefficients, where outputs are counted from the origin."""
+        """Moments (K,) and (K, K) of the coefficients for outputs from the origin, given those for outputs from 0."""
         return shift_output_origin(self.model, mean, cov, self.origin)
 
     def moments_about_zero(self, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The moments of which `moments_about_origin` makes these."""
+        """The inverse of `moments_about_origin`."""
         return shift_output_origin(self.model, mean, cov, -self.origin)
 
     def truncated(self, max_samples: int) -> IdentificationProblem:
-        """The same with the first samples of each record only."""
-        return self.with_segments([(record, 0) for record in range(len(self.u))], max_samples)
+        """The same with the first ``max_samples`` samples of each record alone."""
+        return self.with_segments([Segment(record, 0) for record in range(len(self.u))], max_samples)
 
-    def with_segments(self, segments: Sequence[tuple[int, int]], max_samples: int) -> IdentificationProblem:
-        """The same with pieces of records in their place, each of so many samples at most.
+    def with_segments(self, segments: Sequence[Segment], max_samples: int) -> IdentificationProblem:
+        """The same with segments in place of the records.
 
         Args:
-            segments: the number of a record, and the sample that the piece begins with.
-            max_samples: of each.
+            segments: the segments.
+            max_samples: samples of each, at most.
         """
         u, y, times = [], [], []
         for record, first_sample in segments:
@@ -188,11 +214,11 @@ class IdentificationProblem:
         evenly = None if self.times is None else tuple(one - one[0] for one in times)
         return replace(self, u=tuple(u), y=tuple(y), times=evenly)
 
-    def most_driven_segments(self, segment_length: int) -> list[tuple[int, int]]:
-        """Of each record, its number and the sample that a piece of so many begins with, which shows what an input did.
+    def most_driven_segments(self, segment_length: int) -> list[Segment]:
+        """Of each record, the segment of ``segment_length`` samples that shows the effect of the input.
 
-        It is the first, unless the input is far stronger elsewhere: the last piece that holds the strongest inputs, and
-        some of what was before them.
+        This is the first, unless the input is far stronger elsewhere: then the last segment with the strongest inputs,
+        from a little before them.
         """
         segments = []
         for record, (u, y) in enumerate(zip(self.u, self.y, strict=True)):
@@ -202,18 +228,18 @@ class IdentificationProblem:
             begin = 0
             if power[0] < _WEAK_INPUT_POWER * power.max():
                 begin = max(0, int(np.flatnonzero(power > _STRONG_INPUT_POWER * power.max())[-1]) - segment_length // 8)
-            segments.append((record, begin))
+            segments.append(Segment(record, begin))
         return segments
 
-    def largest_output_segment(self, segment_length: int) -> tuple[int, int]:
-        """The number of a record, and the sample that a piece of so many begins with, of the largest outputs."""
+    def largest_output_segment(self, segment_length: int) -> Segment:
+        """The segment of ``segment_length`` samples with the largest outputs of all records."""
         powers = [sliding_sums(np.nan_to_num(y) ** 2, segment_length) for y in self.y]
         record = int(np.argmax([power.max() for power in powers]))
-        return record, int(powers[record].argmax())
+        return Segment(record, int(powers[record].argmax()))
 
     @cached_property
     def is_free_decay(self) -> bool:
-        """Whether no input acts: then m is no matter of the records, and counts as 1 in the unit of the scales."""
+        """Whether no input acts; m is then undetermined, and counts as 1 in the unit of the scales."""
         return not any(u.any() for u in self.u)
 
     @cached_property
@@ -229,7 +255,7 @@ class IdentificationProblem:
 
     @cached_property
     def mean_frequency(self) -> float:
-        """Where the outputs have their power: the mean angular frequency [rad per sample], robust to white noise."""
+        """Mean angular frequency of the outputs by power [rad per sample], robust to white noise."""
         power = total = 0.0
         for y in self.resampled_evenly().y:
             whole = interpolate_gaps(y, _MAX_BRIDGED_GAP)
@@ -243,12 +269,12 @@ class IdentificationProblem:
 
     @cached_property
     def displacement(self) -> float:
-        """Root mean square of the displacement inside, as far as the frequency tells."""
+        """Root mean square of the scaled displacement, estimated by the mean frequency."""
         return self.output_rms / self.mean_frequency ** DERIVATIVE_ORDER_OF_SENSOR[self.rig.output.kind]
 
     @cached_property
     def max_state(self) -> FloatArray:
-        """(2,) the largest displacement and velocity of a sample, as far as the frequency tells."""
+        """(2,) largest displacement and velocity of a sample, estimated by the mean frequency."""
         x = (
             max(float(np.nanmax(np.abs(y))) for y in self.y)
             / self.mean_frequency ** DERIVATIVE_ORDER_OF_SENSOR[self.rig.output.kind]
@@ -257,11 +283,11 @@ class IdentificationProblem:
 
     @property
     def initial_state_cov(self) -> FloatArray:
-        """(2, 2) covariance of the state before a record: it may begin in any motion."""
+        """(2, 2) covariance of the state before a record, which may begin in any motion."""
         return np.diag((3 * self.max_state) ** 2)
 
     def natural_coefficient_sizes(self) -> dict[str, float]:
-        """Sizes of the coefficients at which each term is as large as the others."""
+        """Coefficient to the size at which its term is as large as the others."""
         w, x = self.mean_frequency, self.displacement
         sizes = {
             "stiffness": w**2,
@@ -276,6 +302,6 @@ class IdentificationProblem:
         """Mean and standard deviation of each coefficient that a term of `OPTIONAL_TERMS` brings."""
         if term != "dry_friction":
             return [(0.0, self.natural_coefficient_sizes()[term])]
-        # The speed below which friction fades is no matter of the records: a small part of the usual speed.
+        # The records do not determine the speed below which friction fades: it is a small part of the usual speed.
         creep = _CREEP_SPEED_FRACTION * self.mean_frequency * self.displacement
         return [(0.0, self.natural_coefficient_sizes()["friction"]), (creep, 0.01 * creep)]

@@ -1,9 +1,9 @@
-"""The motion that each record begins in.
+"""Most probable initial state of each record.
 
-The filter of a fit is linear about where it believes the oscillator to be. A record may begin anywhere, and an
-accelerometer or a strong resonance does not tell where at once: a filter that begins at rest takes the difference for
-noise, and its coefficients are wrong. So it begins at the most probable motion, at the coefficients of the fit before;
-unless all of the record is explained far better by where it began then, or by rest, in each of the wells too.
+The filter of a fit is linear about its estimate of the state. A record may begin in any motion, and an accelerometer or
+a strong resonance does not reveal it at once: a filter that begins at rest takes the difference for noise, and its
+coefficients are wrong. Therefore the filter begins at the most probable state at the coefficients of the previous fit,
+unless the previous state, or rest at an equilibrium of the spring, explains the whole record far better.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _GRID_EXTENT = 1.5
 #: Bounds of the samples on which the grid is judged; between them it is one period.
 _JUDGED_SAMPLES_BOUNDS = (16, 256)
 
-#: Series that are judged at once, about.
+#: Series that the filter takes at once, about.
 _MAX_SERIES_PER_BATCH = 2048
 
 #: Sensor noise of the first Newton steps, as a fraction of the output, at least: with it the filter converges from the
@@ -36,7 +36,8 @@ _COARSE_SENSOR_FRACTION = 0.3
 #: Newton steps with that noise, and with the noise of the hypothesis.
 _NEWTON_STEPS = (4, 6)
 
-#: Nats by which another motion must be better. A few do not tell: the filter is not linear about the same place.
+#: Likelihood by which the previous state or rest must be better [nats]. A few nats do not count: the filter is linear
+#: about different points.
 _MIN_GAIN = 10.0
 
 #: Step of the finite differences, in largest states.
@@ -45,26 +46,26 @@ _FINITE_DIFFERENCE_STEP = 1e-3
 #: Longest Newton step, in largest states.
 _MAX_NEWTON_STEP = 0.3
 
-#: Parts of Newton's step that are tried.
+#: Fractions of the Newton step that are tried.
 _LINE_SEARCH_FRACTIONS = np.array([1.0, 0.3, 0.1, 0.01])
 
-#: Offsets of the points whose losses tell slope and curvature by x and v.
+#: Offsets of the points whose losses give gradient and Hessian by x and v.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]], dtype=np.float64)
 
 
 def find_initial_states(
     problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, sensor_std: float
 ) -> FloatArray:
-    """The most probable displacement and velocity a sample before each record.
+    """The most probable displacement and velocity one sample before each record.
 
     Args:
         problem: the records.
-        hypothesis: about the input and the noises, with the motions that were found before.
+        hypothesis: the input path, the noise ratio, and the previous initial states.
         points: (P, K) coefficients.
-        sensor_std: σ_v.
+        sensor_std: sensor noise σ_v.
 
     Returns:
-        (P, records, 2), scaled.
+        (P, records, 2) states, scaled.
     """
     period = 2 * np.pi / problem.mean_frequency
     first_period = problem.truncated(int(np.clip(period, *_JUDGED_SAMPLES_BOUNDS)))
@@ -74,7 +75,7 @@ def find_initial_states(
 
     losses = _initial_state_loss(first_period, hypothesis, points, np.zeros((2, 2)))
     coarse_sensor_std = max(sensor_std, _COARSE_SENSOR_FRACTION * problem.output_rms)
-    # In parts, where many records make many series.
+    # In batches, because many records make many series.
     parts = np.array_split(np.repeat(grid, len(series), axis=1), -(-len(series) * len(grid) // _MAX_SERIES_PER_BATCH))
     found = grid[np.concatenate([losses(unit * part, coarse_sensor_std) for part in parts]).argmin(axis=0), 0]
     for sensor in np.repeat([coarse_sensor_std, sensor_std], _NEWTON_STEPS):
@@ -93,9 +94,9 @@ def find_initial_states(
 
 
 def _newton_step(stencil_losses: FloatArray) -> FloatArray:
-    """(records, 2) steps to the minimum of parabolas through losses at `_STENCIL`; downhill where they have none."""
+    """(records, 2) Newton steps for the losses at `_STENCIL`; downhill where the Hessian is not positive definite."""
     here, right, left, up, down, both, neither = stencil_losses
-    with np.errstate(invalid="ignore"):  # infinite where the numbers ran away
+    with np.errstate(invalid="ignore"):  # infinite where the filter diverged
         slope = np.stack([right - left, up - down], axis=1) / (2 * _FINITE_DIFFERENCE_STEP)
         xx, vv = right - 2 * here + left, up - 2 * here + down
         xv = (both + neither - right - left - up - down + 2 * here) / 2
@@ -114,9 +115,9 @@ def _newton_step(stencil_losses: FloatArray) -> FloatArray:
 def _initial_state_loss(
     problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, cov: FloatArray
 ) -> Callable[[FloatArray, float], FloatArray]:
-    """Candidates (C, S, 2) and σ_v to minus the log likelihoods (C, S) of what begins there, within cov.
+    """A function from initial states (C, S, 2) and σ_v to negative log likelihoods (C, S).
 
-    Each of the S series is a record at one of the points (P, K).
+    Each of the S series is a record at one of the points (P, K); ``cov`` is the covariance of the initial state.
     """
     inputs, outputs, spans, _ = problem.filter_samples(*hypothesis.input_path)
     ratio = hypothesis.noise_ratio
@@ -141,9 +142,9 @@ def _initial_state_loss(
 
 
 def well_displacements(problem: IdentificationProblem, coefficients: FloatArray) -> FloatArray:
-    """(n, P) displacements at which the spring of some of the coefficients (P, K) is without force, beside its middle.
+    """(n, P) displacements of the two wells of the spring at coefficients (P, K), from its inflection.
 
-    None where no spring has two wells; 0 for one that has not.
+    Empty where no spring has two wells; 0 for each spring that has one.
     """
     names = list(problem.model.coefficients)
     stiffness, cubic = coefficients[:, names.index("stiffness")], coefficients[:, names.index("cubic")]

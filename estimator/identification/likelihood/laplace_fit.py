@@ -1,14 +1,15 @@
-"""Many hypotheses about the same records, each fitted to its most probable coefficients, in a lane of its own.
+"""Laplace approximation of the posterior of the coefficients, for many hypotheses about the same records at once.
 
-A hypothesis says how the input went between samples, with which delay, which terms the equation has, and how the two
-noises share what the outputs show: σ_w/σ_v. With the Kalman filter's innovations ν_t and their variances S_t at the
-coefficients ψ it is judged by the free energy of a Gaussian at the minimum (variational Laplace),
+A hypothesis states interpolation, delay and lag of the input, the terms of the equation, and the noise ratio σ_w/σ_v.
+With the Kalman filter's innovations ν_t and their variances S_t at the coefficients ψ, its evidence is the free energy
+of a Gaussian at the minimum (variational Laplace),
 
     L = ½ Σ_t (ν_t²/S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0),    F = L + ½ log det(Λ0 + I) - ½ log det Λ0,
 
-with the information I of `estimator.inference.fisher_information`. The level of the noises is not searched: S grows with it as a whole,
-so at the best level Σ ν²/S is the number of outputs N, and ½ Σ(...) = ½ (Σ log S + N log(Σ ν²/S / N) + N). The
-first outputs of a record, as many as there are states, do not count: any motion may have been before them.
+with the information I of `estimator.inference.fisher_information`. The level of the noises needs no search: all S are
+proportional to it, so that at the best level Σ ν²/S is the number of outputs N, and the first sum of L is
+½ (Σ log S + N log(Σ ν²/S / N) + N). The first outputs of each record, as many as there are states, do not count,
+because the initial state is unknown.
 """
 
 from __future__ import annotations
@@ -48,24 +49,24 @@ _MIN_DAMPING = 1e-9
 #: Damping above which a fit ends.
 _MAX_DAMPING = 1e2
 
-#: A step that promises to lower the loss by less is the last of a fit [nats]: it is a seventh of a standard deviation,
-#: of which it leaves a small part.
-_MIN_PROMISED_GAIN = 1e-2
+#: Predicted decrease of the loss below which a step is the last of a fit [nats]: the step is a seventh of a standard
+#: deviation, and the remaining error is far smaller.
+_MIN_PREDICTED_GAIN = 1e-2
 
-#: So many times what the last step gained is what a fit may still gain.
+#: Largest remaining decrease of the free energy, in decreases by the last step.
 _REMAINING_GAIN_FACTOR = 10.0
 
 
 class _FilterInputs(NamedTuple):
-    """What does not move in a fit of H hypotheses of G kinds: how the input went, and with which delay.
+    """The constant part of a fit of H hypotheses with G input paths.
 
     Attributes:
-        input_path_index: (H,) of each.
-        inputs: (G, records, N, rows).
-        outputs: (G, records, N, 1).
-        spans: (G, records, N), or None.
-        noise_ratios: (H,).
-        initial_states: (H, records, 2).
+        input_path_index: (H,) index of the input path of each hypothesis.
+        inputs: (G, records, N, rows) inputs over the samples.
+        outputs: (G, records, N, 1) outputs at their ends.
+        spans: (G, records, N) lengths of the samples in steps; None where all are one step.
+        noise_ratios: (H,) σ_w/σ_v.
+        initial_states: (H, records, 2) states one sample before each record.
     """
 
     input_path_index: npt.NDArray[np.intp]
@@ -76,7 +77,7 @@ class _FilterInputs(NamedTuple):
     initial_states: FloatArray
 
     def of(self, chosen: npt.NDArray[np.intp]) -> _FilterInputs:
-        """That of some hypotheses."""
+        """The inputs of the chosen hypotheses."""
         return self._replace(
             input_path_index=self.input_path_index[chosen],
             noise_ratios=self.noise_ratios[chosen],
@@ -85,7 +86,7 @@ class _FilterInputs(NamedTuple):
 
 
 def _pad_series(series: FloatArray, n_samples: int, n_rows: int | None = None) -> FloatArray:
-    """(records, N, ...) made longer with NaN, and wider with zeros."""
+    """A series (records, N, ...) padded to ``n_samples`` with NaN, and to ``n_rows`` with zeros."""
     missing = n_samples - series.shape[1]
     if n_rows is not None:
         series = np.pad(series, ((0, 0), (0, 0), (0, n_rows - series.shape[2])))
@@ -97,11 +98,11 @@ def _pad_series(series: FloatArray, n_samples: int, n_rows: int | None = None) -
 
 
 class LaplaceFitter:
-    """Fits hypotheses about a problem.
+    """Fits the coefficients of many hypotheses to the records of a problem.
 
     Args:
-        problem: the records.
-        prior: of the coefficients.
+        problem: the records and the equation.
+        prior: prior of the coefficients.
     """
 
     def __init__(self, problem: IdentificationProblem, prior: CoefficientPrior) -> None:
@@ -110,7 +111,7 @@ class LaplaceFitter:
         self._samples: dict[tuple[str, float, float], FilterSamples] = {}
 
     def for_problem(self, problem: IdentificationProblem) -> LaplaceFitter:
-        """The same for other records."""
+        """A fitter of another problem, with the same prior."""
         return LaplaceFitter(problem, self.prior)
 
     def fit(
@@ -122,16 +123,16 @@ class LaplaceFitter:
         give_up_above: float = np.inf,
         fixed_directions: FloatArray | None = None,
     ) -> LaplaceFits:
-        """Fit each hypothesis by damped Gauss-Newton steps (Levenberg and Marquardt).
+        """Fit each hypothesis by damped Gauss-Newton steps (Levenberg-Marquardt).
 
         Args:
-            hypotheses: H of them.
-            initial_coefficients: (K,) or (H, K) coefficients to begin with.
-            initial_sensor_std: (H,) or one: σ_v to begin with.
-            iterations: at most.
-            give_up_above: a free energy; a hypothesis that cannot come below it is given up.
-            fixed_directions: (H, K) directions: no step changes their products with the coefficients. Covariances and free
-                energies are as if nothing were pinned.
+            hypotheses: the H hypotheses.
+            initial_coefficients: (K,) or (H, K) coefficients to start from.
+            initial_sensor_std: σ_v to start from, one or (H,).
+            iterations: steps, at most.
+            give_up_above: free energy; the fit of a hypothesis that cannot come below it ends.
+            fixed_directions: (H, K) directions whose products with the coefficients no step changes. Covariances and
+                free energies do not take them into account.
         """
         count, k = len(hypotheses), len(self._scale)
         points = np.broadcast_to(initial_coefficients, (count, k)).copy()
@@ -152,11 +153,11 @@ class LaplaceFitter:
                 if scaled_directions is None
                 else solve_with_fixed_directions(damped, gradient[active], scaled_directions[active])
             )
-            promised = -0.5 * np.einsum("hk,hk->h", gradient[active], step)
+            predicted = -0.5 * np.einsum("hk,hk->h", gradient[active], step)
             trial = points[active] + self._scale * step
             found = self._loss_and_derivatives(trial, filter_inputs.of(active), sensor_stds[active])
-            better = found[0] <= loss[active]  # False for what is not finite
-            gained = np.where(better, loss[active] - found[0], promised)
+            better = found[0] <= loss[active]  # False for a loss that is not finite
+            gained = np.where(better, loss[active] - found[0], predicted)
             accepted = active[better]
             points[accepted] = trial[better]
             loss[accepted], gradient[accepted], curvature[accepted], sensor_stds[accepted] = (
@@ -168,7 +169,7 @@ class LaplaceFitter:
                 _DAMPING_INCREASE * damping[active],
             )
             is_finished = (
-                (promised < _MIN_PROMISED_GAIN)
+                (predicted < _MIN_PREDICTED_GAIN)
                 | (damping[active] > _MAX_DAMPING)
                 | (self._free_energy(loss[active], curvature[active]) - _REMAINING_GAIN_FACTOR * gained > give_up_above)
             )
@@ -178,7 +179,7 @@ class LaplaceFitter:
         return LaplaceFits(tuple(hypotheses), points, cov, sensor_stds, energies, loss)
 
     def record_noise_scales(self, hypothesis: FitHypothesis, coefficients: FloatArray, sensor_std: float) -> FloatArray:
-        """(records,) the noises that each record shows at coefficients (K,), in parts of what they are on the whole."""
+        """(records,) noises of each record at coefficients (K,), relative to the noises of all."""
         filter_inputs, n_observed = self._filter_inputs([hypothesis]), [np.isfinite(y).sum() for y in self.problem.y]
         misfits = self._run_filter(coefficients[None], filter_inputs, np.array([sensor_std])).innovations_squared
         known_scales = (
@@ -212,7 +213,7 @@ class LaplaceFitter:
     def _loss_and_derivatives(
         self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Loss (H,), its slope (H, K) and curvature (H, K, K) in units of the prior, and the best levels (H,)."""
+        """Loss (H,), its gradient (H, K) and curvature (H, K, K) by prior standard deviations, and best σ_v (H,)."""
         problem, count, records = self.problem, len(points), len(self.problem.u)
         n = problem.n_observed_outputs - records * problem.model.n_states
         found = self._run_filter(points, filter_inputs, sensor_stds)
@@ -238,12 +239,9 @@ class LaplaceFitter:
         )
 
     def _run_filter(self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray) -> FilteredRecords:
-        """What the filter finds in all records at each of the points (H, K)."""
-        problem, records, inputs = (
-            self.problem,
-            len(self.problem.u),
-            filter_inputs.inputs[filter_inputs.input_path_index],
-        )
+        """The filter's results for all records at each of the points (H, K)."""
+        problem, records = self.problem, len(self.problem.u)
+        inputs = filter_inputs.inputs[filter_inputs.input_path_index]
         return filter_records(
             problem.model,
             np.repeat(points, records, axis=0),
@@ -260,10 +258,10 @@ class LaplaceFitter:
         )
 
     def _free_energy(self, loss: FloatArray, curvature: FloatArray) -> FloatArray:
-        """(H,) free energies; inf where they are not finite."""
+        """(H,) free energies; inf where one is not finite."""
         log_det = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(self._in_prior_units(self.prior.precision))[1]
         return np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
 
     def _in_prior_units(self, precision: FloatArray) -> FloatArray:
-        """A precision of the coefficients, of these in standard deviations of the prior."""
+        """A precision of the coefficients, in units of the prior's standard deviations."""
         return precision * np.outer(self._scale, self._scale)

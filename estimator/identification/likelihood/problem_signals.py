@@ -1,4 +1,4 @@
-"""Signals of an identification problem: bridged gaps, masked outputs, rows of inputs, shifted origins."""
+"""Signals of an identification problem: bridged gaps, masked outputs, input rows of the filter, shifted origins."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from estimator.support.array_types import FloatArray
 
 
 def interpolate_gaps(y: FloatArray, max_gap: float) -> FloatArray:
-    """Outputs (T,) with straight lines through gaps of no more than so many samples.
+    """Outputs (T,) with straight lines through gaps of at most ``max_gap`` samples.
 
     Example:
         >>> interpolate_gaps(np.array([0.0, np.nan, 2.0, np.nan, np.nan, 5.0, np.nan]), 1)
@@ -30,23 +30,23 @@ def interpolate_gaps(y: FloatArray, max_gap: float) -> FloatArray:
 
 
 def sliding_sums(values: FloatArray, samples: int) -> FloatArray:
-    """Sums of pieces of so many values, one for each place where a piece may begin."""
+    """Sums of ``samples`` values in a row, one for each begin."""
     sums = np.concatenate([[0.0], np.cumsum(values)])
     samples = min(samples, len(values))
     return np.asarray(sums[samples:] - sums[: len(sums) - samples])
 
 
 def mask_unexplained_outputs(y: FloatArray, rig: Rig, extra_delay: int = 0) -> FloatArray:
-    """Outputs (T,) of a record, NaN where inputs acted that came before it and that nobody recorded.
+    """Outputs (T,) of a record, with NaN where inputs from before the record act.
 
-    What these had done before the first output that is left does not count: the oscillator may be in any motion.
+    The effect of those inputs on later outputs is part of the unknown initial state.
 
     Args:
-        y: outputs.
-        rig: whose they are.
+        y: (T,) outputs.
+        rig: the rig of the record.
         extra_delay: samples by which the input may be later than the rig says.
     """
-    # An accelerometer shows the force itself, not only what it did.
+    # An accelerometer measures the force itself, not only its effect.
     n_masked = max(0, math.ceil(rig.delay)) + extra_delay + (DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind] == 2)
     masked = y.copy()
     masked[: min(n_masked, len(y) - 1)] = np.nan
@@ -54,7 +54,7 @@ def mask_unexplained_outputs(y: FloatArray, rig: Rig, extra_delay: int = 0) -> F
 
 
 def filter_input_rows(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
-    """(T, rows) what a model takes over the sample before each output; after the last input it stays the same."""
+    """(T, rows) input of a model over the sample before each output; after the last input it stays constant."""
     input_feed = input_stencil(model, rig)
     if input_feed.needs_whole_record:
         return input_feed.spline_coefficients(u)
@@ -70,18 +70,18 @@ def filter_input_rows(model: Model, rig: Rig, u: FloatArray) -> FloatArray:
 def shift_output_origin(
     model: Model, mean: FloatArray, cov: FloatArray, origin: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments where outputs are counted from another origin, of a displacement: z'' = force - stiffness z + ..."""
+    """Moments of the coefficients for displacements from another origin: z'' = force - stiffness z + ...."""
     jacobian, offset = np.eye(len(mean)), np.zeros(len(mean))
     names = list(model.coefficients)
     jacobian[names.index("force"), names.index("stiffness")] = -origin
     offset[names.index("output_offset")] = -origin
     shifted_cov = jacobian @ cov @ jacobian.T
-    # An inverse of what is nearly singular, such as what few samples tell, is symmetric to fewer digits than it has.
+    # The inverse of a nearly singular matrix, such as of few samples, is symmetric to fewer digits than it has.
     return jacobian @ mean + offset, (shifted_cov + shifted_cov.T) / 2
 
 
 def stack_padded(series: list[FloatArray], columns: int) -> FloatArray:
-    """(n, T, columns) of n series: columns that one lacks are 0, and a shorter one ends with NaN."""
+    """(n, T, columns) of n series: missing columns are 0, and a shorter series ends with NaN."""
     stacked = np.full((len(series), max(map(len, series)), columns), np.nan)
     for row, one in zip(stacked, series, strict=True):
         row[: len(one)] = 0.0
