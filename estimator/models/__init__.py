@@ -1,4 +1,4 @@
-"""Models: what the next output is, given the last ones, the input and the coefficients. One file a model."""
+"""Models of plants: differential and difference equations with unknown coefficients, one file each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM, PENDULUM_EULER
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 
-#: Name of a model to what makes it.
+#: Name of a model to a function that makes it.
 MODELS: dict[str, Callable[[], Model]] = {
     "difference": difference,
     "duffing": duffing,

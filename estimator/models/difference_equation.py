@@ -2,8 +2,8 @@
 
     x_t = θ1 x_{t-1} + θ2 x_{t-1}³ + θ3 x_{t-2} + η u_{t-1} + w̃,        y_t = x_t + v
 
-Other terms are products of powers of the two lags and possibly an input tap. With an offset and three taps the model
-takes up what the hold of a single tap leaves out of a band-limited input.
+Other terms are products of powers of the two lags and possibly an input tap. An offset and three taps represent a
+band-limited input better than the hold of a single tap.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Term(NamedTuple):
     Attributes:
         lag1: power of x_{t-1}, 0 to 16.
         lag2: power of x_{t-2}, 0 to 16.
-        tap: delay of the input that multiplies it, 0 to 2, counted from the newest input that acts; None for no input.
+        tap: delay of the input that multiplies it, 0 to 2, from the newest input that acts; None for no input.
     """
 
     lag1: int = 0
@@ -31,14 +31,14 @@ class Term(NamedTuple):
 
     @property
     def expression(self) -> str:
-        """Such as ``x1``, ``x1**3``, ``x1**2*x2`` or ``u``; ``1`` for the offset."""
+        """Expression of the term, such as ``x1``, ``x1**3``, ``x1**2*x2`` or ``u``; ``1`` for the offset."""
         factors = [f"{x}**{n}" if n > 1 else x for x, n in (("x1", self.lag1), ("x2", self.lag2)) if n]
         factors += [] if self.tap is None else ["u" if self.tap == 0 else f"u{self.tap}"]
         return "*".join(factors) or "1"
 
     @property
     def unit(self) -> str:
-        """Of its coefficient, with x and u in volts."""
+        """Unit of its coefficient, with x and u in volts."""
         power = 1 - self.lag1 - self.lag2 - (self.tap is not None)
         return {0: "1", 1: "V"}.get(power, f"V^{power}")
 
@@ -46,7 +46,8 @@ class Term(NamedTuple):
 _PAPER_TERMS = (Term(1), Term(3), Term(0, 1))
 _INPUT_TAPS = (Term(tap=0), Term(tap=1), Term(tap=2))
 
-#: Presets by name. ``paper`` has the regressors of Eq. (2), in its order; ``linear`` is the paper's FEM-LARX.
+#: Name of a preset to its terms. ``paper`` has the regressors of Eq. (2), in its order; ``linear`` is the FEM-LARX of
+#: the paper.
 PRESETS: dict[str, tuple[Term, ...]] = {
     "paper": (*_PAPER_TERMS, Term(tap=0)),
     "linear": (Term(1), Term(0, 1), Term(tap=0)),
@@ -55,13 +56,15 @@ PRESETS: dict[str, tuple[Term, ...]] = {
     "cubic": (*_PAPER_TERMS, *_INPUT_TAPS, Term(), Term(2), Term(2, 1), Term(1, 2), Term(0, 3)),
 }
 
-#: Eqs. (3) and (4): the coefficients of an oscillator, and the oscillator of coefficients.
+#: Eq. (3): coefficient to its formula in the parameters of an oscillator.
 _COEFFICIENT_FORMULAS = {
     "theta1": "(2*m + c*step - a*step**2)/(m + c*step)",
     "theta2": "-b*step**2/(m + c*step)",
     "theta3": "-m/(m + c*step)",
     "eta": "step**2/(m + c*step)",
 }
+
+#: Eq. (4): parameter of an oscillator to its formula in the coefficients.
 _PHYSICAL_FORMULAS = {
     "m": "-theta3*step**2/eta",
     "c": "(1 + theta3)*step/eta",
@@ -74,12 +77,12 @@ def difference(preset: str | tuple[Term, ...] = "paper") -> Model:
     """Eq. (2), or another difference equation that is linear in its coefficients.
 
     Args:
-        preset: a name of `PRESETS`, or terms of one's own. The coefficients of ``paper`` are called theta1, theta2,
-            theta3 and eta, and know m, c, a and b by Eqs. (3) and (4); ``linear`` has no theta2 and no b; those of
-            other terms are k0, k1, ...
+        preset: a name of `PRESETS`, or terms. The coefficients of ``paper`` are theta1, theta2, theta3 and eta, with m,
+            c, a and b by Eqs. (3) and (4); ``linear`` has no theta2 and no b. The coefficients of other terms are k0,
+            k1, ...
 
     Raises:
-        ValueError: for an unknown preset, terms that repeat or are not terms, or a power or tap out of its range.
+        ValueError: for an unknown preset, for repeated terms or other objects, or for a power or tap out of its range.
     """
     is_terms = isinstance(preset, tuple) and all(isinstance(term, Term) for term in preset)
     if not is_terms and not (isinstance(preset, str) and preset in PRESETS):

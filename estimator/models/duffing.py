@@ -8,8 +8,9 @@ With an input offset u0 and an output offset y0 it is the motion of z = x + y0 u
 
     z'' = gain u + force - damping z' - stiffness z - cubic (z - y0)³,    y = z + v,    force = stiffness y0 - gain u0.
 
-Outputs tell z and the force at once, but u0 and y0 only together. A filter that linearises in x, u0 and y0 takes the
-changes of its own stiffness and gain for news that tells them apart, and its intervals become far too narrow.
+Outputs identify z and the force at once, but u0 and y0 only together. A filter that is linear in x, u0 and y0 mistakes
+the changes of its own stiffness and gain for information that separates the two, and its intervals become far too
+narrow.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from functools import cache
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_bool, check_choice
 
-#: Of the parameters of Eq. (1): powers of the units of input and displacement, and of the second.
+#: Parameter of Eq. (1) to its powers of the input's unit, the displacement's unit and the second.
 PARAMETER_DIMENSIONS = {"m": (1, -1, 2), "c": (1, -1, 1), "a": (1, -1, 0), "b": (1, -3, 0)}
 
-#: What a sensor may show, and the number of time derivatives.
+#: Kind of a sensor to the order of the time derivative of the displacement that it measures.
 DERIVATIVE_ORDER_OF_SENSOR = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
@@ -36,20 +37,20 @@ def duffing(
     noise: str = "white",
     sensor: str = "displacement",
 ) -> Model:
-    """Eq. (1), with terms that real oscillators have.
+    """Eq. (1), with optional terms of real oscillators.
 
     Args:
-        offsets: of the output (y0) and of the input (as a constant force).
-        cubic_damping: a term e x'³ of the damping.
-        quintic: a term q x⁵ of the stiffness.
-        feedthrough: d u in the output.
-        dry_friction: a force f sign(x'), which is f x'/√(x'² + s²) below the speed s.
-        noise: ``white`` in the acceleration, or ``held``: constant over a sample. Of unit strength it would move x by 1
-            within a sample, without spring and damper.
-        sensor: what it shows: ``displacement``, ``velocity`` or ``acceleration``.
+        offsets: offsets of the output (y0) and of the input (as a constant force).
+        cubic_damping: a damping force e x'³.
+        quintic: a stiffness force q x⁵.
+        feedthrough: a term d u in the output.
+        dry_friction: a force f sign(x'), smoothed to f x'/√(x'² + s²) with the speed s.
+        noise: process noise of the acceleration: ``white``, or ``held`` over each sample. With unit strength it moves x
+            by 1 within a sample, without spring and damper.
+        sensor: measured quantity: ``displacement``, ``velocity`` or ``acceleration``.
 
     Raises:
-        ValueError: for another noise or sensor.
+        ValueError: for an unknown noise or sensor.
     """
     terms = {
         "offsets": offsets, "cubic_damping": cubic_damping, "quintic": quintic, "feedthrough": feedthrough,
@@ -67,7 +68,7 @@ def _duffing(
     offsets: bool, cubic_damping: bool, quintic: bool, feedthrough: bool, dry_friction: bool, noise: str, sensor: str
 ) -> Model:
     order = DERIVATIVE_ORDER_OF_SENSOR[sensor]
-    # The state is the displacement with its offset, where that is what the sensor shows.
+    # The state of a displacement sensor includes the offset.
     x = "(x - output_offset)" if offsets and order == 0 else "x"
     coefficients = {"stiffness": "1", "cubic": "V⁻²", "damping": "1", "gain": "1"}
     acceleration = f"gain*u - damping*v - stiffness*x - cubic*{x}**3"
@@ -77,7 +78,7 @@ def _duffing(
     per_step, by_step = (("", ""), ("/step", "*step**1"), ("/step**2", "*step**2"))[order]
 
     def add(name: str, unit: str, parameter: str, text: str, dimension: tuple[int, int, int], back: str) -> None:
-        """A coefficient, and the parameter that goes with it: its expression, its dimension, and the way back."""
+        """Add a coefficient and its parameter: unit, expression of the parameter, dimension, and inverse expression."""
         coefficients[name], inverse[name] = unit, back
         physical[parameter], dimensions[parameter] = text, dimension
 

@@ -1,7 +1,7 @@
-"""What a model is: one equation, written once, from which everything else is derived.
+"""`Model`: one equation of a plant, from which all compiled code is derived.
 
-A model is a plain declaration. `estimator.engine` makes of it the plant that an environment steps, the filter, the
-Fisher information, what a planner imagines and the gradient that an oracle climbs.
+A model is a declaration. From it `estimator.engine` derives the simulated plant, the filter, the Fisher information,
+the predictions of a planner and the gradients of an oracle.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from functools import cached_property
 
 from estimator.support.argument_checks import check_bool, check_integer, check_mapping, short_repr
 
-#: Names of states, coefficients and sensors: what begins with a capital letter belongs to the engine.
+#: Names of states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
 
 #: Functions that expressions may use.
 FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh", "abs")
 
-#: Functions that generated code calls for them: a magnitude is Python's own, and its slope a sign.
+#: Functions that generated code imports for these: abs is a builtin of Python, and its derivative is a sign.
 GENERATED_FUNCTIONS = tuple("sign" if name == "abs" else name for name in FUNCTIONS)
 
-#: Highest power in an expression: one of a whole number is calculated as a product.
+#: Highest power in an expression; integer powers are computed as products.
 MAX_POWER = 16
 
-#: Names that stand for something else: the input and its older values, the sampling step, what generated code calls.
+#: Names with another meaning: the input and its older values, the sampling step, and functions of generated code.
 RESERVED_NAMES = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, *GENERATED_FUNCTIONS, "capped", "range"})
 
 
-#: What an expression is made of.
+#: Syntax nodes that an expression may have.
 _ALLOWED_SYNTAX = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, ast.Add, ast.Sub, ast.Mult,
     ast.Div, ast.Pow, ast.USub, ast.UAdd,
@@ -41,10 +41,15 @@ _ALLOWED_SYNTAX = (
 
 
 def names_in_expression(text: object, allowed: Collection[str], owner: str) -> set[str]:
-    """Names that an expression uses, besides `FUNCTIONS`.
+    """The names in an expression, without `FUNCTIONS`.
+
+    Args:
+        text: the expression.
+        allowed: names that it may use.
+        owner: name of the model, for messages.
 
     Raises:
-        ValueError: naming the text, for what is no formula or uses another name than the known ones.
+        ValueError: naming the text, for a text that is no formula or uses another name.
     """
     if not isinstance(text, str) or "__" in text or len(text) > 10_000:
         raise ValueError(f"expressions of {owner} must be short strings without '__', but one is {text!r:.80}")
@@ -67,33 +72,34 @@ def names_in_expression(text: object, allowed: Collection[str], owner: str) -> s
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A plant with unknown coefficients, as a person would write it on paper.
+    """The equation of a plant with unknown coefficients.
 
-    Either ``rates`` (a differential equation; time is counted in samples) or ``next_state`` (a difference equation) is
-    given. All expressions are strings in the names of states and coefficients and the input ``u``, with ``sin``,
-    ``cos``, ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose slope at 0 counts as 0. In a difference equation
-    ``u`` is the newest input that acts on the next state, ``u1`` and ``u2`` are the inputs one and two samples before.
+    A model has either ``rates`` (a differential equation; time counts samples) or ``next_state`` (a difference
+    equation). All expressions are strings in the names of states and coefficients and the input ``u``, with ``sin``,
+    ``cos``, ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose derivative at 0 counts as 0. In a difference
+    equation ``u`` is the newest input that acts on the next state, and ``u1`` and ``u2`` are the inputs one and two
+    samples before.
 
     Attributes:
-        name: of the model, for messages and for the names of generated files.
-        states: name to unit.
-        coefficients: name to unit; all of them are unknown and constant (or walk slowly, where an estimator drifts).
-        noise: per state, how process noise of unit strength moves it: for rates, its white intensity's root, or where
-            ``held`` a force that is constant over a sample; for a next state, what is added to it.
-        outputs: name of a sensor to what it shows without its own noise; at least one. The process noise's strength is
-            counted as the first sensor would show that of one sample.
-        rates: the states' derivatives by time.
+        name: name of the model, for messages and generated files.
+        states: state to unit.
+        coefficients: coefficient to unit; all are unknown and constant, or drift slowly where an estimator assumes it.
+        noise: per state, the effect of process noise of unit strength: for rates, the root of its white intensity, or a
+            force that is constant over a sample where ``held``; for a next state, the added noise.
+        outputs: sensor to its measured quantity, without sensor noise; at least one. The strength of the process noise
+            is its effect on the first sensor within one sample.
+        rates: time derivatives of the states.
         next_state: the states one sample later.
-        held: whether the process noise of a differential equation is held over a sample, instead of white.
-        substeps: Runge-Kutta steps of order 4 per sample: enough that the error of integration stays below a tenth of
-            the standard deviation that a long record leaves.
+        held: whether the process noise of a differential equation is held over each sample, and not white.
+        substeps: Runge-Kutta steps of order 4 per sample, enough that the integration error stays below a tenth of the
+            standard deviation after a long record.
         physical: parameter of the plant to its expression in coefficients and the sampling ``step`` [s]; may be empty.
-        dimensions: of these parameters: powers of the units of input and displacement, and of the second.
+        dimensions: parameter to its powers of the input's unit, the displacement's unit and the second.
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
 
     Raises:
-        ValueError: naming the argument, for a name that is not a lower-case identifier or stands twice, expressions
-            that do not fit the names, a coefficient that does nothing, or an output that nothing moves.
+        ValueError: naming the argument, for a name that is not a lower-case identifier or occurs twice, expressions
+            with unknown names, a coefficient without effect, or an output that depends on no state or coefficient.
 
     Example:
         >>> from estimator.models.model import Model
@@ -121,7 +127,7 @@ class Model:
         check_mapping("dimensions", self.dimensions, Sequence)
         for field_name in ("noise", "rates", "next_state"):
             texts = getattr(self, field_name)
-            if isinstance(texts, list):  # as JSON holds it
+            if isinstance(texts, list):  # from JSON
                 texts = tuple(texts)
                 object.__setattr__(self, field_name, texts)
             if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):
@@ -141,16 +147,17 @@ class Model:
         for name in (self.name, *names):
             if not _NAME_PATTERN.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED_NAMES:
                 raise ValueError(
-                    f"names must be lower-case identifiers, none of {sorted(RESERVED_NAMES)}, but one is {name!r}; rename it"
+                    f"names must be lower-case identifiers, none of {sorted(RESERVED_NAMES)}, but one is {name!r}; "
+                    f"rename it"
                 )
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
-        # Of x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the row P_x_a_b.
+        # With x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the covariance P_x_a_b.
         joined_names = [f"{i}_{j}" for i in self.names for j in self.names]
         shared = sorted({pair for pair in joined_names if joined_names.count(pair) > 1})
         if shared:
-            raise ValueError(f"pairs of names must be told apart when joined by '_', but {shared} stand twice; rename")
+            raise ValueError(f"pairs of names must differ when joined by '_', but {shared} occur twice; rename one")
         if bool(self.rates) == bool(self.next_state):
             raise ValueError("either rates or next_state must be given; rates for a differential equation")
         for field_name, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
@@ -161,7 +168,7 @@ class Model:
         if not self.states or not self.outputs:
             raise ValueError("states and outputs must name at least one each, but one of them is empty")
         if self.held and not self.is_continuous:
-            raise ValueError("held must be False for a difference equation, whose noise comes once a sample")
+            raise ValueError("held must be False for a difference equation, whose noise acts once per sample")
         if set(self.dimensions) != set(self.physical):
             raise ValueError(f"dimensions must be of {list(self.physical)}, but are of {list(self.dimensions)}")
         if bool(self.physical) != bool(self.inverse) or (self.inverse and set(self.inverse) != set(self.coefficients)):
@@ -170,13 +177,13 @@ class Model:
                 f"{list(self.inverse)}"
             )
         self._validate_expressions()
-        # By name, in whatever order they are written.
+        # In the order of the names, whatever the order in which they are written.
         object.__setattr__(self, "dimensions", {name: self.dimensions[name] for name in self.physical})
         if self.inverse:
             object.__setattr__(self, "inverse", {name: self.inverse[name] for name in self.coefficients})
 
     def _validate_expressions(self) -> None:
-        """Refuse those that are no formulas of the names they may use, and what they leave without effect."""
+        """Refuse expressions with unknown names, coefficients without effect, and outputs without a state."""
         inputs = ("u",) if self.is_continuous else ("u", "u1", "u2")
         for texts, known in ((self.physical, self.coefficients), (self.inverse, self.physical)):
             for text in texts.values():
@@ -200,7 +207,7 @@ class Model:
 
     @property
     def moves(self) -> tuple[str, ...]:
-        """The rates or the next state."""
+        """Expressions of the rates or of the next state."""
         return self.rates or self.next_state
 
     @property
@@ -220,28 +227,28 @@ class Model:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """States, then coefficients: the order of every joint mean and covariance."""
+        """States, then coefficients: the order of joint means and covariances."""
         return (*self.states, *self.coefficients)
 
     @cached_property
     def taps(self) -> int:
-        """Inputs that a difference equation looks at: 1, or 2 or 3 where it names ``u1`` or ``u2``."""
+        """Number of inputs in a difference equation: 1, or 2 or 3 where it contains ``u1`` or ``u2``."""
         text = " ".join((*self.moves, *self.outputs.values()))
         return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
 
     @cached_property
     def movers(self) -> tuple[str, ...]:
-        """The states, and the coefficients on which the motion depends: a sensor's alone do not move anything."""
+        """The states and the coefficients that the motion depends on, without coefficients of sensors alone."""
         used = set(re.findall(r"[a-z]\w*", " ".join(self.moves)))
         return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property
     def digest(self) -> str:
-        """Twelve hexadecimal digits that tell models apart."""
-        # Not all that the object holds: what it has calculated of itself is no part of it.
+        """Twelve hexadecimal digits that identify the model."""
+        # The fields alone, without cached properties.
         values = {one.name: getattr(self, one.name) for one in fields(self)}
-        described = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
-        return hashlib.sha256(described.encode()).hexdigest()[:12]
+        text = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
@@ -251,15 +258,15 @@ class Model:
 
     @classmethod
     def require_model(cls, value: object) -> Model:
-        """The value, which must be a model.
+        """The value itself, which must be a model.
 
         Raises:
-            ValueError: where it is not one.
+            ValueError: for another object.
         """
         if not isinstance(value, cls):
             raise ValueError(f"model must be a Model, but is {short_repr(value)}; use difference() or duffing()")
         return value
 
     def to_dict(self) -> dict[str, object]:
-        """The declaration as JSON can hold it; ``Model(**d)`` makes the same model again."""
+        """The declaration for JSON; ``Model(**d)`` makes the same model again."""
         return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}

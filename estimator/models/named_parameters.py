@@ -13,7 +13,7 @@ class Parameters(Mapping[str, Any]):
 
     Args:
         values: name to value, or pairs of both.
-        named: further ones.
+        named: further names and values.
 
     Example:
         >>> Parameters(m=6.0e-6, c=3.0e-4, a=1.2, b=3.5).a

@@ -1,7 +1,7 @@
 """The conditionally linear stochastic pendulum of IO-SMC² (Iqbal et al., ICML 2024): q'' = -p1 sin q - p2 q' + p3 u.
 
-There it is stepped by Euler's rule, under which an oscillation grows by itself, here by 1.8 % a sample. `PENDULUM_EULER`
-is that rule, and so the published plant; `PENDULUM` is the differential equation.
+The published plant takes steps of Euler's rule, under which an oscillation grows without input, here by 1.8 % per
+sample. `PENDULUM_EULER` is this plant; `PENDULUM` is the differential equation.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from dataclasses import replace
 
 from estimator.models.model import Model
 
-#: Seconds between two samples.
+#: Sampling step [s].
 PENDULUM_SAMPLING_STEP = 0.05
 
-#: Both states are seen. Time is counted in samples, so the angular velocity w is in rad per sample and the coefficients
-#: are p1 δ², p2 δ and p3 δ². Noise of unit strength would move q by 1 within a sample.
+#: The pendulum as a differential equation, with sensors of both states. Time counts samples, so that the angular
+#: velocity w is in rad per sample, and the coefficients are p1 δ², p2 δ and p3 δ². Process noise of unit strength moves
+#: q by 1 within a sample.
 PENDULUM = Model(
     name="pendulum",
     states={"q": "rad", "w": "rad"},
@@ -28,8 +29,8 @@ PENDULUM = Model(
     inverse={"gravity": "p1*step**2", "friction": "p2*step", "torque": "p3*step**2"},
 )
 
-#: The same by Euler's rule. Process noise of unit strength moves w by 1 rad per sample, and so the angle of the next
-#: sample, which the first sensor shows: of an angle alone the noise of this sample would not be seen.
+#: The pendulum by Euler's rule. Process noise of unit strength moves w by 1 rad per sample, and thereby the angle of
+#: the next sample. The first sensor measures that angle, because the present angle does not contain the present noise.
 PENDULUM_EULER = replace(
     PENDULUM,
     name="pendulum_map",

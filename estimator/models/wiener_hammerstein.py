@@ -1,15 +1,14 @@
-"""A Wiener-Hammerstein system: a filter of second order, a static cubic, a filter of first order.
+"""A Wiener-Hammerstein system: a second-order filter, a static cubic, and a first-order filter in series.
 
-The structure that Kouw (2020) names as future work. The first filter rings at the input, the cubic bends what it gives,
-and the second filter smooths that; only its output is seen.
+Kouw (2020) names this structure as future work. A sensor measures the output of the second filter alone.
 """
 
 from __future__ import annotations
 
 from estimator.models.model import Model
 
-#: The gain of the first filter is 1 at rest, and that of the cubic at small signals: otherwise gains could move from
-#: one block to the next, and no input could tell them apart.
+#: The system. The static gain of the first filter and the small-signal gain of the cubic are 1: otherwise no input
+#: could distinguish the gains of the blocks.
 WIENER_HAMMERSTEIN = Model(
     name="wiener_hammerstein",
     states={"x": "V", "v": "V", "z": "V"},

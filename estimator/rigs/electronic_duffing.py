@@ -1,4 +1,4 @@
-"""The open-hardware board GhislainRaze/Electronic-Duffing: what its potentiometers make of m, c, a and b."""
+"""Rig of the open-hardware board GhislainRaze/Electronic-Duffing, by the settings of its potentiometers."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _GUESS_HALF_WIDTHS = {"m": 0.2, "c": 0.5, "a": 0.2, "b": 0.2}
 def electronic_duffing(
     p1: float = 0.1311, p2: float = 0.1923, p3: float = 0.9887, wells: int = 1, kind: str = "displacement"
 ) -> Rig:
-    """The board's rig, for its potentiometers.
+    """The rig of the board.
 
-    Its documentation's equation (5) gives, with the parts of its table 1, m = 1e-4 s², c = 1e-3 p1 s, a = ±10 p2 and
-    b = p3 V⁻², input and displacement in volts. The guess is ±20 % about these, ±50 % for c.
+    Equation (5) of its documentation gives, with the components of table 1, m = 1e-4 s², c = 1e-3 p1 s, a = ±10 p2 and
+    b = p3 V⁻², with input and displacement in volts. The guess is ±20 % about these, ±50 % for c.
 
     Args:
-        p1: division ratio of the potentiometer of the damping, above 0 and at most 1.
-        p2: of the linear stiffness.
-        p3: of the cubic stiffness.
-        wells: 1 or 2, as the board's switch stands.
-        kind: what is recorded: ``displacement`` in volts, or ``velocity`` in volts per second: 1000 of them for each
+        p1: division ratio of the damping potentiometer, above 0 and at most 1.
+        p2: division ratio of the linear stiffness.
+        p3: division ratio of the cubic stiffness.
+        wells: 1 or 2, by the board's switch.
+        kind: recorded output: ``displacement`` in volts, or ``velocity`` in volts per second, which are 1000 for each
             volt at the board's output.
 
     Raises:
-        ValueError: naming the argument that is out of its range.
+        ValueError: naming an argument that is out of its range.
 
     Example:
         >>> from estimator.rigs.electronic_duffing import electronic_duffing

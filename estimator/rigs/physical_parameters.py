@@ -1,4 +1,4 @@
-"""From a model's coefficients to the plant's physical parameters and back, with slopes: generated from its own maps."""
+"""Maps between the coefficients of a model and physical parameters, with Jacobians, compiled from its expressions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import check_mapping, to_float_array
 from estimator.support.array_types import FloatArray
 
-#: Parameters that are turned into coefficients and back differ by no more than this part of their terms.
+#: Error of a parameter after a round trip through the coefficients, relative to its terms, at most.
 _ROUND_TRIP_TOLERANCE = 1e-6
 
 
@@ -21,9 +21,9 @@ def to_physical(model: Model, coefficients: FloatArray, scales: Scales = VOLT_SC
     """Physical parameters (..., p) of coefficients (..., K); the coefficients themselves, for a model without any.
 
     Args:
-        model: whose `Model.physical`.
-        coefficients: (..., K), time counted in samples.
-        scales: what one inside is worth.
+        model: the model, with `Model.physical`.
+        coefficients: (..., K) scaled coefficients.
+        scales: physical values of the scaled units.
     """
     points = to_float_array("coefficients", coefficients)
     if points.shape[-1:] != (Model.require_model(model).n_coefficients,):
@@ -34,7 +34,7 @@ def to_physical(model: Model, coefficients: FloatArray, scales: Scales = VOLT_SC
 
 
 def physical_jacobian(model: Model, coefficients: FloatArray, scales: Scales = VOLT_SCALES) -> FloatArray:
-    """Slopes (..., p, K) of the physical parameters by the coefficients; arguments as `to_physical`."""
+    """Jacobian (..., p, K) of the physical parameters by the coefficients; arguments as `to_physical`."""
     k = model.n_coefficients
     if not model.physical:
         return np.broadcast_to(np.eye(k), (*np.shape(coefficients), k)).copy()
@@ -45,7 +45,7 @@ def physical_jacobian(model: Model, coefficients: FloatArray, scales: Scales = V
 def propagate_to_physical(
     model: Model, mean: FloatArray, cov: FloatArray, scales: Scales = VOLT_SCALES
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments (..., p) and (..., p, p) of the physical parameters from those of the coefficients, to first order."""
+    """Moments (..., p) and (..., p, p) of the physical parameters from moments of the coefficients, to first order."""
     slopes = physical_jacobian(model, mean, scales)
     return to_physical(model, mean, scales), slopes @ cov @ np.swapaxes(slopes, -1, -2)
 
@@ -54,13 +54,13 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
     """Coefficients (..., K) of physical parameters of shape (...), by name; themselves, for a model without any.
 
     Args:
-        model: whose `Model.inverse`.
-        parameters: name to value, such as `estimator.Parameters`; others than the model's are not looked at.
-        scales: what one inside is worth.
+        model: the model, with `Model.inverse`.
+        parameters: name to value, such as `estimator.Parameters`; further names are ignored.
+        scales: physical values of the scaled units.
 
     Raises:
-        ValueError: for a parameter that is missing; or where the model's two maps contradict each other at the first
-            of the parameters.
+        ValueError: for a missing parameter; or where the model's two maps contradict each other at the first of the
+            parameters.
     """
     names = list(model.physical if Model.require_model(model).inverse else model.coefficients)
     check_mapping("parameters", parameters)
@@ -80,27 +80,28 @@ def coefficients_of(model: Model, parameters: Mapping[str, Any], scales: Scales 
 
 
 def _check_inverse(model: Model, parameters: FloatArray, coefficients: FloatArray, step: float) -> None:
-    """Refuse a model whose ``physical`` does not turn back (K,) coefficients into the (p,) parameters they are of."""
+    """Refuse a model whose ``physical`` does not return the (p,) parameters that (K,) coefficients came from."""
     values, slopes = (_evaluate(function, coefficients, step) for function in _compiled_map(model, "physical"))
-    # A parameter rounds by parts of the terms that it is the sum of.
+    # The rounding error of a parameter is relative to the terms of its sum.
     terms = np.abs(slopes.reshape(-1, len(coefficients))) @ np.abs(coefficients)
     for name, expected, recovered, size in zip(model.physical, parameters, values, terms, strict=True):
         if abs(recovered - expected) > _ROUND_TRIP_TOLERANCE * (abs(expected) + size):
             given = ", ".join(f"{c}={value:.6g}" for c, value in zip(model.coefficients, coefficients, strict=True))
             raise ValueError(
-                f"inverse must undo physical, but by that of {model.name!r} {name}={expected:.6g} is {given}, and by "
-                f"physical these are {name}={recovered:.6g} again, where a step is {step:g} s; mend one of the two"
+                f"inverse must undo physical, but the inverse of {model.name!r} turns {name}={expected:.6g} into "
+                f"{given}, and physical turns these into {name}={recovered:.6g}, at a step of {step:g} s; mend one of "
+                f"them"
             )
 
 
 @cache
 def _physical_scales(model: Model, scales: Scales) -> FloatArray:
-    """(p,) what one inside is worth, of each physical parameter."""
+    """(p,) factors from scaled to physical numbers of the parameters."""
     return np.array([scales.factor(dimension) for dimension in model.dimensions.values()])
 
 
 def _evaluate(function: Any, points: FloatArray, step: float) -> FloatArray:
-    """Its results, stacked along the last axis, at given numbers along the last axis."""
+    """Results of a function, stacked along the last axis, for points (..., n) of its n arguments."""
     columns = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     found = [np.broadcast_to(value, columns.shape[1:]) for value in function(*columns, step)]
     return np.stack(found, axis=-1).astype(np.float64)
@@ -108,7 +109,7 @@ def _evaluate(function: Any, points: FloatArray, step: float) -> FloatArray:
 
 @cache
 def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
-    """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
+    """Functions of all coefficients (or parameters) and the step: values of a map, and its derivatives."""
     from estimator.engine import source_cache
 
     mapped = getattr(model, direction)

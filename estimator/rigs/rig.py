@@ -1,4 +1,4 @@
-"""The rig: how an oscillator stands in the world. Units, sampling step and scales are here, and nowhere else."""
+"""`Rig`: an oscillator in the laboratory, with sampling step, units, limits, input interpolation, delay and guess."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
 from estimator.models.model import Model
 from estimator.rigs.channel import Channel
 from estimator.rigs.rig_toml import rig_file_text
@@ -26,43 +26,44 @@ from estimator.support.argument_checks import (
 )
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
-#: How the input goes between samples, and the degree of the polynomial that each takes.
+#: Interpolation of the input between samples, to the degree of its polynomial.
 INTERPOLATION_DEGREES = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
 
-#: Those of which the input may act a part of a sample later.
+#: Interpolations that allow a fractional delay.
 FRACTIONAL_DELAY_INTERPOLATIONS = ("zero_order", "linear", "spline")
 
-#: More samples of delay are a record that was not aligned.
+#: Largest delay [samples]: a larger one is a record that is not aligned.
 MAX_DELAY = 1000
 
-#: No rig file is larger [bytes].
+#: Largest rig file [bytes].
 _MAX_FILE_BYTES = 2**20
 
-#: Rigs that come with the package: name to file.
+#: Name of a rig that comes with the package, to its file.
 SHIPPED_RIGS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"), key=lambda p: p.stem)}
 
-_GUESSED_PARAMETERS = ("m", "c", "a", "b")
+#: Parameters of a guess.
+_GUESSED_PARAMETERS = tuple(PARAMETER_DIMENSIONS)
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Sampling step, input and output of an oscillator, and what is guessed of it. u and y are paired by index.
+    """An oscillator with its input and output channels, and a guess of its parameters. u and y are paired by index.
 
     Attributes:
         step: sampling step [s].
-        interpolation: of the input of a differential equation; a difference equation has taps instead. ``zero_order``:
-            u[k] acts from sample k to k + 1, and is first seen in y[k+1]: an accelerometer, too, shows y[k] just before
-            the input goes to u[k]. ``linear``: from u[k-1] to u[k]. Both are causal, and the input before the first was
-            0. ``look_ahead``: the quintic spline through the last nine inputs and the next one, so that a sample is
-            used when the next input is known. ``spline``: the quintic spline through all inputs, for recorded data that
-            is given at once. Before their first input it was the same.
-        delay: samples by which the input acts later than that. A difference equation's newest tap acts on y[k] with
-            u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, where pairs are those of
-            an environment: u[k] acted before y[k]. `identify` takes parts of a sample, from above -1 on.
-        input: its unit, limit, noise and offset.
-        output: its unit, kind, range, noise and offset.
-        guess: parameter m, c, a, b to the central 90 % interval of what is believed of it, in the units of the
-            channels; of any sign, but m is positive. None: nothing is known.
+        interpolation: interpolation of the input of a differential equation; a difference equation has taps instead.
+            ``zero_order``: u[k] acts from sample k to k + 1, so that its first effect is on y[k+1]; an accelerometer,
+            too, measures y[k] just before the input changes to u[k]. ``linear``: from u[k-1] to u[k]. Both are causal,
+            and the input before the first is 0. ``look_ahead``: the quintic spline through the last nine inputs and the
+            next one, so that a sample is processed when the next input is known. ``spline``: the quintic spline through
+            all inputs of a whole record. Before the first input, both splines are constant.
+        delay: additional delay of the input [samples]. The newest tap of a difference equation acts on y[k] with
+            u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, with the pairs of an
+            environment: u[k] acts before y[k]. `identify` takes fractional delays, above -1.
+        input: the input channel.
+        output: the output channel.
+        guess: parameter m, c, a, b to the central 90 % interval of its prior, in the units of the channels; any sign is
+            possible, but m is positive. None: no guess.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -87,9 +88,7 @@ class Rig:
         least = -1 if self.interpolation == "zero_order" else 0
         if isinstance(self.delay, float) and not self.delay.is_integer():
             check_number(f"delay (for {self.interpolation})", self.delay, -0.999, MAX_DELAY)
-            check_choice(
-                "interpolation (for a delay in parts of a sample)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS
-            )
+            check_choice("interpolation (for a fractional delay)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS)
         else:
             check_integer(f"delay (for {self.interpolation})", self.delay, MAX_DELAY, least)
         for name, other in (("input", "range"), ("output", "limit")):
@@ -111,23 +110,23 @@ class Rig:
             )
         if self.input.kind != "displacement":
             raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
-        if (told := sensor_kind_of_unit(self.output.unit)) not in (None, self.output.kind):
+        if (kind := sensor_kind_of_unit(self.output.unit)) not in (None, self.output.kind):
             raise ValueError(
-                f"output.kind must be {told!r} with the unit {self.output.unit}, but is {self.output.kind!r}; mend one"
+                f"output.kind must be {kind!r} with the unit {self.output.unit}, but is {self.output.kind!r}; mend one"
             )
         object.__setattr__(self, "guess", _check_guess(self.guess))
 
     @classmethod
     def silverbox(cls, interpolation: str = "spline", delay: int = 0) -> Rig:
-        """The Silverbox record's, which ships: its input is band-limited. Online take ``linear`` or ``look_ahead``."""
+        """The rig of the Silverbox record, with a band-limited input. Online use ``linear`` or ``look_ahead``."""
         return replace(cls.shipped("silverbox"), interpolation=interpolation, delay=delay)
 
     @classmethod
     def shipped(cls, name: str) -> Rig:
-        """A rig that comes with the package.
+        """A rig that comes with the package, by its name.
 
         Raises:
-            ValueError: for another name.
+            ValueError: for an unknown name.
 
         Example:
             >>> from estimator import Rig
@@ -139,32 +138,32 @@ class Rig:
 
     @classmethod
     def from_dict(cls, mapping: Mapping[str, Any]) -> Rig:
-        """From nested dictionaries, as `to_dict` gives them, or a rig file holds them.
+        """A rig from nested dictionaries, such as of `to_dict` or a rig file.
 
         Raises:
-            ValueError: naming the key, for one that is unknown or missing, or a value out of its range.
+            ValueError: naming the key, for an unknown or missing key, or a value out of its range.
         """
         return _from_mapping(cls, mapping, "rig")
 
     @classmethod
     def from_file(cls, path: str | Path) -> Rig:
-        """Read a rig file, TOML: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
+        """Read a TOML rig file: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
 
-        A table ``instrument`` is for who drives the rig (`read_with_instrument`).
+        A table ``instrument`` holds settings of the plant (`read_with_instrument`).
 
         Raises:
-            ValueError: naming the file and what is wrong in it.
-            FileNotFoundError: if there is no such file.
+            ValueError: naming the file and the fault.
+            FileNotFoundError: for a file that does not exist.
         """
         return cls._read(path)[0]
 
     @classmethod
     def read_with_instrument(cls, rig: str) -> tuple[Rig, dict[str, Any]]:
-        """A rig, as `of` has it, and the table ``instrument`` of its file; of a rig that ships, and of none, empty.
+        """A rig by name or file, and the table ``instrument`` of its file; an empty table where there is none.
 
         Raises:
             ValueError: as `from_file`, or for an ``instrument`` that is no table.
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: for a file that does not exist.
         """
         return (cls.shipped(rig), {}) if rig in SHIPPED_RIGS else cls._read(rig)
 
@@ -186,9 +185,12 @@ class Rig:
 
     @classmethod
     def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
-        """A rig from whatever describes one: itself, a dictionary, the name of its file, or that of one that ships.
+        """A rig from a rig, a dictionary, the name of a file, or the name of a rig that comes with the package.
 
-        Where a file has the name of a rig that ships, write ``./beam``.
+        For a file with the name of a rig of the package, write ``./beam``.
+
+        Raises:
+            ValueError: for anything else, or as `from_dict` and `from_file`.
         """
         if isinstance(rig, Rig):
             return rig
@@ -199,11 +201,11 @@ class Rig:
         raise ValueError(f"rig must be a Rig, a dictionary or a file name, but is {rig!r:.60}; use Rig(step=...)")
 
     def save(self, path: str | Path) -> None:
-        """Write a rig file, with comments, from which `from_file` gives the same rig; what was there is replaced.
+        """Write a rig file with comments, from which `from_file` reads the same rig; an existing file is replaced.
 
         Raises:
-            ValueError: for what is not the name of a file.
-            OSError: where it cannot be written; what was there before still is.
+            ValueError: for a path that is no name of a file.
+            OSError: where it cannot be written; an existing file stays as it was.
 
         Example:
             >>> from estimator import Rig
@@ -226,7 +228,7 @@ class Rig:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """What JSON and TOML can hold, without what was left out."""
+        """The rig as nested dictionaries for JSON and TOML, without unknown values."""
         mapping: dict[str, Any] = asdict(self)
         mapping["guess"] = None if self.guess is None else {name: list(ends) for name, ends in self.guess.items()}
         for name in ("input", "output"):
@@ -235,27 +237,27 @@ class Rig:
 
     @property
     def integer_delay(self) -> int:
-        """The delay, for those that follow the input sample by sample.
+        """The delay [samples], for estimators and plants that take the input sample by sample.
 
         Raises:
-            ValueError: for a delay in parts of a sample, or a lag of the input, which `identify` alone follows.
+            ValueError: for a fractional delay, or a lag of the input, which `identify` alone takes.
         """
         if self.input.lag is not None:
-            raise ValueError(f"input must have no lag but for identify, but has {self.input.lag} s; leave it out")
+            raise ValueError(f"input must have no lag, except for identify, but has {self.input.lag} s; leave it out")
         if self.delay != int(self.delay):
-            raise ValueError(f"delay must be whole samples but for identify, but is {self.delay}; round it")
+            raise ValueError(f"delay must be an integer, except for identify, but is {self.delay}; round it")
         return int(self.delay)
 
     @property
     def scales(self) -> Scales:
-        """The input's limit and the output's range, 1 where they are not known, with step and units."""
+        """The scales: the input's limit and the output's range, 1 where unknown, with step and units."""
         order = DERIVATIVE_ORDER_OF_SENSOR[self.output.kind]
         units = self.input.unit, self.output.unit
         return Scales(float(self.step), self.input.limit or 1.0, self.output.range or 1.0, order, *units)
 
     @property
     def model(self) -> Model:
-        """Eq. (1) with offsets, as the rig's sensor shows it."""
+        """Eq. (1) with offsets, and with the output of the rig's sensor."""
         return duffing(offsets=True, sensor=self.output.kind)
 
 
@@ -265,7 +267,7 @@ def _read_shipped(name: str) -> Rig:
 
 
 def _check_guess(guess: object) -> dict[str, tuple[float, float]] | None:
-    """Checked intervals; None where nothing is guessed."""
+    """The checked intervals of a guess; None without a guess."""
     if guess is None:
         return None
     if not isinstance(guess, Mapping) or set(guess) != set(_GUESSED_PARAMETERS):
@@ -291,7 +293,7 @@ def _check_guess(guess: object) -> dict[str, tuple[float, float]] | None:
 
 
 def _from_mapping(cls: Any, mapping: object, label: str) -> Any:
-    """An object of a dataclass, from a dictionary of its arguments."""
+    """A `Rig` or `Channel` from a dictionary of its arguments; ``label`` names it in messages."""
     if not isinstance(mapping, Mapping):
         raise ValueError(f"{label} must be a table of names and values, but is {mapping!r:.60}")
     known = [one.name for one in fields(cls)]
@@ -304,6 +306,6 @@ def _from_mapping(cls: Any, mapping: object, label: str) -> Any:
         return cls(**mapping)
     try:
         return cls(**mapping)
-    except ValueError as error:  # which begins with the name of a key
+    except ValueError as error:  # its message begins with the name of a key
         key, _, rest = str(error).partition(" ")
         raise ValueError(f"{label}.{key} {rest.removeprefix(f'of an {label} ')}") from error

@@ -1,4 +1,4 @@
-"""The prior of a rig: what its guess says of the coefficients, before a record that may begin in motion."""
+"""Prior belief of a rig: moments of the coefficients from its guess, with an unknown initial state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
 
-#: Standard deviations of an interval's half width: the central 90 % of a Gaussian.
+#: Half width of the central 90 % interval of a Gaussian, in standard deviations.
 STDS_PER_90_PERCENT = 1.6448536269514722
 
 #: Standard deviation of an offset, as a fraction of the channel's scale.
@@ -24,7 +24,7 @@ OFFSET_STD_FRACTION = 0.03
 #: Standard deviation of an unstated noise, as a fraction of the channel's scale.
 NOISE_STD_FRACTION = 0.001
 
-#: Of a displacement at the start, in parts of the output's scale.
+#: Standard deviation of the initial displacement, as a fraction of the output's scale.
 _INITIAL_DISPLACEMENT_FRACTION = 0.3
 
 #: Quadrature points along each parameter.
@@ -35,16 +35,16 @@ _OFFSET_NODES = 3
 
 
 def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
-    """What is believed of a rig before its first sample.
+    """The belief of a rig before its first sample.
 
-    c, a and b are Gaussian with the guess as their central 90 %, m is log-normal with the same interval (its inverse
-    must have moments), the offsets Gaussian about those of the channels. The noises' priors are weak, about those of
-    the channels: of the input's noise f, the disturbance of the force, σ_w is what moves the velocity as much as f does
-    when it is held over a sample.
+    c, a and b are Gaussian with the guess as their central 90 %; m is log-normal with the same interval, because its
+    inverse must have moments; the offsets are Gaussian about the offsets of the channels. The priors of the noises are
+    weak, about the noises of the channels. The input's noise f is a disturbance of the force; σ_w is the process noise
+    that changes the velocity as much as f held over a sample.
 
     Args:
-        rig: with a guess.
-        scales: of input and output inside; the rig's own where they are None.
+        rig: the rig, with a guess.
+        scales: scales of input and output; None: the rig's.
 
     Raises:
         ValueError: for a rig without a guess.
@@ -59,22 +59,21 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
 
 
 def belief_from_moments(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatArray) -> Belief:
-    """A belief in given moments of the coefficients of the rig's model, before a record that may begin in motion."""
+    """A belief with given moments of the coefficients of the rig's model, and with an unknown initial state."""
     model, coefficients = rig.model, dict(zip(rig.model.coefficients, mean, strict=True))
     joint_mean, joint = _with_unknown_state(model, DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind], mean, cov)
-    force = (rig.input.noise or NOISE_STD_FRACTION * scales.input) / scales.input
-    noises = (
-        coefficients["gain"] * force / np.sqrt(3),
-        (rig.output.noise or NOISE_STD_FRACTION * scales.output) / scales.output,
+    force, sensor = (
+        (channel.noise or NOISE_STD_FRACTION * scale) / scale
+        for channel, scale in ((rig.input, scales.input), (rig.output, scales.output))
     )
-    gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in noises)
+    gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in (coefficients["gain"] * force / np.sqrt(3), sensor))
     return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)
 
 
 def reset_state(belief: Belief) -> Belief:
-    """A belief in a rig of which nobody knows what happened since, as it is before a record that may begin in motion.
+    """The belief with an unknown state, for a new record; coefficients and noises stay.
 
-    Coefficients and noises stay. So does the state of a model that is no oscillator's with a stiffness.
+    The belief of a model that is no oscillator with a stiffness stays as it is.
     """
     if not _is_oscillator(belief.model) or belief.model.n_states != 2:
         return belief
@@ -86,9 +85,13 @@ def reset_state(belief: Belief) -> Belief:
 
 
 def _with_unknown_state(model: Model, order: int, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of states that may be in any motion, and of coefficients with the given ones.
+    """Joint mean and covariance of an unknown state and the coefficients.
 
-    ``order`` is the time derivative of the displacement that the sensor shows.
+    Args:
+        model: the model.
+        order: order of the time derivative of the displacement that the sensor measures.
+        mean: (K,) mean of the coefficients.
+        cov: (K, K) their covariance.
     """
     frequency = _large_motion_frequency(dict(zip(model.coefficients, mean, strict=True)))
     displacement = _INITIAL_DISPLACEMENT_FRACTION / frequency**order
@@ -102,9 +105,9 @@ def _with_unknown_state(model: Model, order: int, mean: FloatArray, cov: FloatAr
 
 
 def equal_effect_log_ratio(belief: Belief) -> float | None:
-    """log(σ_w/σ_v) at which the process noise moves the output as much as the sensor's hides it, about.
+    """log(σ_w/σ_v) at which process noise and sensor noise have about the same effect on the output.
 
-    None for a model without stiffness, of which that is not known.
+    None for a model without stiffness, whose ratio is unknown.
     """
     if not _is_oscillator(belief.model):
         return None
@@ -113,11 +116,12 @@ def equal_effect_log_ratio(belief: Belief) -> float | None:
 
 
 def _is_oscillator(model: Model) -> bool:
+    """Whether a model has a linear and a cubic stiffness."""
     return {"stiffness", "cubic"} <= set(model.coefficients)
 
 
 def _large_motion_frequency(coefficients: Mapping[str, float]) -> float:
-    """Angular frequency of large motions [rad per sample], about."""
+    """Approximate angular frequency of large motions [rad per sample]."""
     return float(
         np.clip(
             np.sqrt(abs(coefficients["stiffness"]) + abs(coefficients["cubic"]) * _INITIAL_DISPLACEMENT_FRACTION**2),
@@ -128,7 +132,7 @@ def _large_motion_frequency(coefficients: Mapping[str, float]) -> float:
 
 
 def _quadrature_axis(name: str, low: float, high: float) -> tuple[FloatArray, FloatArray]:
-    """Points and weights of a parameter."""
+    """Quadrature points and weights of a parameter with a 90 % interval."""
     if name != "m":
         return gauss_hermite((low + high) / 2, (high - low) / 2 / STDS_PER_90_PERCENT, _PARAMETER_NODES)
     points, weights = gauss_hermite(

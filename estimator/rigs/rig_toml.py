@@ -7,14 +7,14 @@ from collections.abc import Mapping
 
 from estimator.rigs.channel import Channel
 
-_EQUATION_COMMENT = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   seen: {seen} + y0 + noise"
+_EQUATION_COMMENT = "#   m x'' + c x' + a x + b x³ = u - u0 + w,   y = {output} + y0 + noise"
 _SYMBOL_OF_KIND = {"displacement": "x", "velocity": "x'", "acceleration": "x''"}
 _INTERPOLATION_COMMENT = (
-    '# Of the input between samples: "zero_order": held, as by a converter; "linear"; "spline": smooth.'
+    '# Interpolation of the input: "zero_order": held, as by a converter; "linear"; "spline": smooth.'
 )
 
 _ACCELERATION_COMMENT = (
-    "# y[k] is the acceleration just before the input goes from u[k-1] to u[k], where it is held (docs/own_data.md)."
+    "# With a held input, y[k] is the acceleration just before the input changes to u[k] (docs/own_data.md)."
 )
 _UNIT_COMMENT = '  # such as "N", "V", "mm" or "m/s"; "1" is a pure number'
 
@@ -43,22 +43,22 @@ def rig_file_text(
     """
     lines = [
         f"# A rig{provenance}. Read by: duffing-env identify, and Rig.from_file.",
-        _EQUATION_COMMENT.format(seen=_SYMBOL_OF_KIND[output_channel.kind]),
+        _EQUATION_COMMENT.format(output=_SYMBOL_OF_KIND[output_channel.kind]),
         "",
         f"step = {float(step)!r}  # s between samples",
         _INTERPOLATION_COMMENT,
         f"interpolation = {_quote(interpolation)}",
-        f"delay = {delay:.12g}  # samples by which the input acts later",
+        f"delay = {delay:.12g}  # samples, of the input",
         "",
         "[input]",
         f"unit = {_quote(input_channel.unit)}{_UNIT_COMMENT if input_channel.unit == '1' else ''}",
         *_column_lines(input_channel),
         _value_or_placeholder("limit", input_channel.limit, "never exceeded, in either direction"),
         *_optional_lines(
-            "lag", input_channel.lag, "s, time constant of a first-order lag between what is recorded and what acts"
+            "lag", input_channel.lag, "s, time constant of a first-order lag between the recorded and the acting input"
         ),
-        *_optional_lines("noise", input_channel.noise, "standard deviation of what disturbs the force"),
-        *_optional_lines("offset", input_channel.offset or None, "u0, a first value"),
+        *_optional_lines("noise", input_channel.noise, "standard deviation of the disturbance of the force"),
+        *_optional_lines("offset", input_channel.offset or None, "u0, a guess"),
         "",
         "[output]",
         f"unit = {_quote(output_channel.unit)}{_UNIT_COMMENT if output_channel.unit == '1' else ''}",
@@ -66,13 +66,11 @@ def rig_file_text(
         f"kind = {_quote(output_channel.kind)}  # displacement, velocity or acceleration",
         *([_ACCELERATION_COMMENT] if output_channel.kind == "acceleration" else []),
         _value_or_placeholder("range", output_channel.range, "an experiment stops outside of it, in either direction"),
-        _value_or_placeholder(
-            "noise", output_channel.noise, "standard deviation of the sensor's noise, where you know it"
-        ),
-        *_optional_lines("offset", output_channel.offset or None, "y0, a first value"),
+        _value_or_placeholder("noise", output_channel.noise, "standard deviation of the sensor's noise, if known"),
+        *_optional_lines("offset", output_channel.offset or None, "y0, a guess"),
         "",
-        "# What you believe before any record: a low and a high end for each, which hold it with 90 %.",
-        "# identify needs none of it.",
+        "# Your guess: the ends of an interval that holds each parameter with a probability of 90 %.",
+        "# identify does not need it.",
     ]
     if guess is None:
         lines += ["# [guess]", *(f"# {name} = [low, high]  # {unit}" for name, unit in units_of_guess.items())]
@@ -83,7 +81,7 @@ def rig_file_text(
 
 
 def _column_lines(channel: Channel) -> list[str]:
-    return [] if channel.column is None else [f"column = {_quote(channel.column)}  # in the records' files"]
+    return [] if channel.column is None else [f"column = {_quote(channel.column)}  # in the files of the records"]
 
 
 def _value_or_placeholder(name: str, value: float | None, meaning: str) -> str:

@@ -1,8 +1,8 @@
-"""Units and scales: between the world of a rig and the numbers near one that compiled code works with.
+"""Units and scales: conversion between physical units and the scaled numbers near 1 of the compiled code.
 
-Inside, time is counted in samples, the input in parts of its scale U, and the displacement in parts of X. A sensor of
-displacement, velocity or acceleration (``order`` 0, 1, 2) has the scale S = X / step**order: its number inside is per
-sample, or per sample squared.
+Scaled time counts samples, the scaled input is in units of its scale U, and the scaled displacement in units of X. A
+sensor of displacement, velocity or acceleration (``order`` 0, 1, 2) has the scale S = X / step**order: its scaled
+output is per sample, or per sample squared.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from estimator.support.argument_checks import check_number
 #: Powers of the input's unit, the displacement's unit and the second.
 UnitPowers = tuple[int, int, int]
 
-#: Smallest and largest size of anything, in its unit: products of several stay within what numbers can hold.
+#: Smallest and largest magnitude of a quantity in its unit: products of several neither underflow nor overflow.
 MAGNITUDE_BOUNDS = 1e-30, 1e30
 
 #: SI units that take prefixes, as a regular expression.
@@ -29,36 +29,45 @@ _SI_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "": 1.0, "
 
 #: Units outside the SI to their factor and SI unit.
 _OTHER_UNITS = {"in": (0.0254, "m"), "ft": (0.3048, "m"), "deg": (math.pi / 180, "rad"), "°": (math.pi / 180, "rad")}
+
+#: Units that take no prefix to their factor and SI unit.
 _UNITS_WITHOUT_PREFIX = {"g": (9.80665, "m/s²"), "lb": (4.4482216152605, "N"), "lbf": (4.4482216152605, "N")}
 _UNITS_WITHOUT_PREFIX |= {"mps": (1.0, "m/s"), "mps2": (1.0, "m/s²")}
+
+#: Suffix of a compound unit to its usual form.
 _COMPOUND_SUFFIXES = {"": "", "/s": "/s", "/s2": "/s²", "/s/s": "/s²", "m": " m", "/V": "/V"}
 
-#: Units that only one kind of output has.
+#: Kind of an output to the pattern of the units that it alone has.
 _UNIT_PATTERN_OF_KIND = {
     "displacement": r"[mµμun]?m|cm|in",
     "velocity": r"[^/]+/s",
     "acceleration": r".+/s(²|\^?2|/s)|m?g",
 }
 
+#: Digits to superscripts, for `str.translate`.
 SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+#: Superscripts to digits, for `str.translate`.
 _DIGITS_OF_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+
+#: A factor of a unit and its power.
 _UNIT_FACTOR = re.compile(r"([^\s·/\d⁰¹²³⁴⁵⁶⁷⁸⁹⁻^-]+)(?:\^?(-?\d+))?")
 
 
 def sensor_kind_of_unit(unit: str) -> str | None:
-    """The kind of output that alone has a unit; None for one that tells none, such as V."""
+    """The kind of output that alone has a unit; None for a unit of any kind, such as V."""
     return next((kind for kind, units in _UNIT_PATTERN_OF_KIND.items() if re.fullmatch(units, unit)), None)
 
 
 def normalise_unit(unit: str) -> str:
-    """A unit in one way of writing."""
+    """A unit in a unique spelling."""
     for written, usual in (("µ", "u"), ("μ", "u"), ("²", "2"), ("^", ""), ("·", " "), ("*", " ")):
         unit = unit.replace(written, usual)
     return unit.replace(" ", "")
 
 
 def to_si_unit(unit: str) -> tuple[float, str]:
-    """A unit as a factor and the unit of SI that it is a part or a multiple of; 1 and itself where it is none such.
+    """The factor and the SI unit of a unit; 1 and the unit itself where it is unknown.
 
     Example:
         >>> [to_si_unit(unit) for unit in ("mm", "µm/s", "N", "m/s^2", "counts")]
@@ -75,27 +84,27 @@ def to_si_unit(unit: str) -> tuple[float, str]:
 
 
 def conversion_factor(source: str, target: str) -> float | None:
-    """By what numbers in one unit are multiplied to be in another; None where these are of different quantities.
+    """Factor from numbers in the source unit to numbers in the target unit; None between different quantities.
 
     Example:
-        >>> conversion_factor("mm", "m"), conversion_factor("in", "in"), conversion_factor("m", "mm"), conversion_factor("mm", "V")
-        (0.001, 1.0, 1000.0, None)
+        >>> conversion_factor("mm", "m"), conversion_factor("m", "mm"), conversion_factor("mm", "V")
+        (0.001, 1000.0, None)
     """
-    (factor, base), (other, own) = to_si_unit(source), to_si_unit(target)
-    return factor / other if normalise_unit(base) == normalise_unit(own) else None
+    (source_factor, source_unit), (target_factor, target_unit) = to_si_unit(source), to_si_unit(target)
+    return source_factor / target_factor if normalise_unit(source_unit) == normalise_unit(target_unit) else None
 
 
 @dataclass(frozen=True)
 class Scales:
-    """What one inside is worth outside.
+    """Physical values of the scaled units.
 
     Attributes:
         step: sampling step [s].
         input: scale U of the input, in its unit.
         output: scale S of the sensor, in its unit.
-        order: time derivative of the displacement that the sensor shows: 0, 1 or 2.
-        input_unit: such as ``"N"``.
-        output_unit: such as ``"m"``, or ``"m/s"`` for a velocity.
+        order: order of the time derivative of the displacement that the sensor measures: 0, 1 or 2.
+        input_unit: unit of the input, such as ``"N"``.
+        output_unit: unit of the output, such as ``"m"``, or ``"m/s"`` for a velocity.
 
     Example:
         >>> from estimator.rigs.units import Scales
@@ -118,15 +127,15 @@ class Scales:
 
     @property
     def displacement(self) -> float:
-        """Scale X of the displacement."""
+        """Scale X of the displacement, in the unit of the output times seconds to the order."""
         return float(self.output * self.step**self.order)
 
     def factor(self, dimension: UnitPowers) -> float:
-        """What one inside is worth, of a quantity whose time is in seconds already."""
+        """Factor from scaled to physical numbers, for a quantity with the given powers whose time is in seconds."""
         return float(self.input ** dimension[0] * self.displacement ** dimension[1])
 
     def unit(self, dimension: UnitPowers) -> str:
-        """Of a quantity, in the units of the rig's channels; ``"1"`` for a pure number."""
+        """Unit of a quantity with the given powers, in the units of the channels; ``"1"`` for a pure number."""
         powers: dict[str, int] = {}
         displacement = _parse_unit(self.output_unit)
         displacement["s"] = displacement.get("s", 0) + self.order
@@ -137,12 +146,12 @@ class Scales:
         return format_unit({atom: power for atom, power in powers.items() if power})
 
 
-#: The Silverbox's: input and output in volts, as they are.
+#: Scales of the Silverbox: input and output in volts, unscaled.
 VOLT_SCALES = Scales()
 
 
 def _parse_unit(unit: str) -> dict[str, int]:
-    """Atoms of a unit such as ``m/s²``, with their powers."""
+    """Factors of a unit such as ``m/s²`` to their powers."""
     powers: dict[str, int] = {}
     for k, part in enumerate(unit.translate(_DIGITS_OF_SUPERSCRIPTS).split("/")):
         for atom, power in _UNIT_FACTOR.findall(part):
@@ -151,7 +160,7 @@ def _parse_unit(unit: str) -> dict[str, int]:
 
 
 def format_unit(powers: Mapping[str, int]) -> str:
-    """A unit from the powers of its atoms."""
+    """A unit from its factors and their powers."""
     if dict(powers) == {"N": 1, "m": -1, "s": 2}:
         return "kg"
     numerator = [atom + _format_power(power) for atom, power in powers.items() if power > 0]
@@ -163,7 +172,7 @@ def format_unit(powers: Mapping[str, int]) -> str:
 
 
 def axis_label(name: str, unit: str) -> str:
-    """What an axis or a column is called.
+    """The label of an axis or a column.
 
     Example:
         >>> axis_label("u", "V"), axis_label("u", "m/s"), axis_label("u", "1")
@@ -179,7 +188,7 @@ def _format_power(power: int) -> str:
 
 
 def digits_to_distinguish(low: float, high: float, minimum: int) -> int:
-    """Significant digits, a ``minimum`` number or more, that show that the ends of an interval differ.
+    """Number of significant digits, at least ``minimum``, that distinguish the ends of an interval.
 
     Example:
         >>> digits_to_distinguish(0.0023, 0.0023000001, 5), digits_to_distinguish(1.0, 2.0, 5)

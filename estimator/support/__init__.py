@@ -1,1 +1,1 @@
-"""What every room needs: checks of arguments, files, progress, pages, array types."""
+"""Support for every package: checks of arguments, files, progress, HTML pages and array types."""

@@ -1,7 +1,4 @@
-"""Parameters of a plant by name, and those of the Silverbox circuit.
-
-Displacement and input of the circuit are both in volts, as in its record.
-"""
+"""Types of arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files: written so that none is ever half-written, and looked at before any is read."""
+"""File input and output: atomic writes, locked folders, and checks before reading and writing."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pathlib import Path
 
 from estimator.support.argument_checks import short_repr
 
-#: Errors of a disk, or a share of one, that has no room.
+#: Errors of a full disk or quota.
 _DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-#: Errors of a place that is protected.
+#: Errors of missing permission.
 _PERMISSION_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
-#: Mode of a file that was not there: not the 0600 of a temporary one.
+#: Mode of a new file, in place of the mode 0600 of a temporary one.
 _NEW_FILE_MODE = 0o644
 
 
 @contextmanager
 def explain_write_errors(path: Path) -> Iterator[None]:
-    """Let what the system says while a file is written name that file, and what to do."""
+    """Add the file and the remedy to the system's errors while a file is written."""
     try:
         yield
     except OSError as error:
@@ -36,10 +36,10 @@ def explain_write_errors(path: Path) -> Iterator[None]:
 
 
 def _resolve_target(path: Path) -> tuple[Path, int]:
-    """The file that is to be written, which a link only names, and the mode that it has or is to have.
+    """The file to write, with links resolved, and its mode.
 
     Raises:
-        OSError: for what is there and is no file, or is read-only, also to root, who may write it all the same.
+        OSError: for a path that is no file, or for a read-only file, also as root, who could write it.
     """
     target = Path(os.path.realpath(path))
     try:
@@ -56,9 +56,9 @@ def _resolve_target(path: Path) -> tuple[Path, int]:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a place where no file can be written, or a folder in which none can, before the work for it begins.
+    """Refuse a path where no file can be written, or a folder in which none can, before the work begins.
 
-    Nothing is left there; what has to be made on the way is not made yet.
+    The check leaves nothing behind, and creates no folders.
 
     Raises:
         OSError: as `write_atomically`.
@@ -72,13 +72,13 @@ def check_writable(path: Path) -> None:
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:
-    """Write a file under a temporary name beside its place, then rename it.
+    """Write a file under a temporary name in the same folder, then rename it.
 
-    A link stays, and what it names is written. A file that was there keeps its mode.
+    A link stays, and its target is written. An existing file keeps its mode.
 
     Raises:
-        OSError: where it cannot be written, such as a device, a pipe, a folder or a read-only file; what was there
-            before still is.
+        OSError: for a path that cannot be written, such as a device, a pipe, a folder or a read-only file; an existing
+            file stays as it was.
     """
     data = content.encode() if isinstance(content, str) else content
     with explain_write_errors(path):
@@ -96,12 +96,12 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 
 def append_atomically(path: Path, text: str) -> None:
-    """Add text to a file, all of it or nothing: what a full disk cut off is taken back.
+    """Append text to a file, all of it or nothing: a part that a full disk cut off is removed.
 
-    Of two programs that add at once, each adds its text in one piece.
+    Two programs that append at once each append their text in one piece.
 
     Raises:
-        OSError: where it cannot be written, such as a device, a pipe, a folder or a read-only file.
+        OSError: for a path that cannot be written, such as a device, a pipe, a folder or a read-only file.
     """
     data, written = text.encode(), 0
     with explain_write_errors(path):
@@ -111,7 +111,7 @@ def append_atomically(path: Path, text: str) -> None:
             while written < len(data):
                 written += os.write(place, data[written:])
         except BaseException:
-            if written and os.fstat(place).st_size == before + written:  # nobody else has added to it
+            if written and os.fstat(place).st_size == before + written:  # no other program has appended
                 os.ftruncate(place, before)
             raise
         finally:
@@ -119,16 +119,16 @@ def append_atomically(path: Path, text: str) -> None:
 
 
 def lock_folder(name: str, folder: Path) -> int | None:
-    """Hold a folder against every other that asks for it so, until the descriptor that is returned is closed.
+    """Lock a folder against other processes that lock it, until the returned descriptor is closed.
 
-    The kernel lets go of it where the process is killed. None where the system or the disk has no such locks.
+    The kernel unlocks it when the process ends. None where the system or the disk has no such locks.
 
     Args:
-        name: of the argument that the folder is, in the message.
-        folder: must be there.
+        name: name of the argument, for messages.
+        folder: the folder, which must exist.
 
     Raises:
-        ValueError: where it is held already.
+        ValueError: where another process has locked it.
     """
     try:
         import fcntl
@@ -138,25 +138,25 @@ def lock_folder(name: str, folder: Path) -> int | None:
     is_unlocked = True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Whoever had it before may have removed it.
+        # The process that had locked it may have removed it.
         is_unlocked = os.path.samestat(os.fstat(descriptor), os.stat(folder))
     except (BlockingIOError, FileNotFoundError):
         is_unlocked = False
-    except OSError:  # such as of a network's disk
+    except OSError:  # such as on a network disk
         os.close(descriptor)
         return None
     if not is_unlocked:
         os.close(descriptor)
         raise ValueError(
-            f"{name} must be a folder that nobody else writes to, but another process does to {folder}; wait for its "
-            "end, or name another"
+            f"{name} must be a folder that no other process writes to, but one writes to {folder}; wait for its end, "
+            f"or name another"
         )
     return descriptor
 
 
 @contextmanager
 def locked_folder(name: str, folder: Path) -> Iterator[None]:
-    """`lock_folder` a folder meanwhile."""
+    """Lock a folder within the context (`lock_folder`)."""
     descriptor = lock_folder(name, folder)
     try:
         yield
@@ -167,10 +167,14 @@ def locked_folder(name: str, folder: Path) -> Iterator[None]:
 
 
 def to_path(name: str, value: object) -> Path:
-    """The path that an argument is, of a file or folder to be written.
+    """The path of a file or folder to write.
+
+    Args:
+        name: name of the argument, for messages.
+        value: its value.
 
     Raises:
-        ValueError: for what is not a path, or a name that no file can have.
+        ValueError: for a value that is no path, or a name that no file can have.
     """
     try:
         path = Path(value)  # type: ignore[arg-type]
@@ -183,17 +187,17 @@ def to_path(name: str, value: object) -> Path:
 
 
 def check_readable_file(path: str | Path, requirement: str, max_bytes: int, remedy_if_absent: str = "") -> Path:
-    """A file that can be read: no folder, nor a pipe or device, which might never end, and none that is too large.
+    """The path of a readable file: no folder, no pipe or device, which might never end, and not too large.
 
     Args:
-        path: of the file.
-        requirement: begins the message: what the argument must be.
-        max_bytes: bytes.
-        remedy_if_absent: ends the message where there is no such file: how to come by one.
+        path: the file.
+        requirement: begin of the message, with the requirement on the argument.
+        max_bytes: largest size [bytes].
+        remedy_if_absent: end of the message for a missing file, with a way to get one.
 
     Raises:
         ValueError: for anything else, or a name that no file can have.
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: for a file that does not exist.
     """
     try:
         file = Path(path)

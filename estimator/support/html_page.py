@@ -1,4 +1,4 @@
-"""Pages that show results: single HTML files, which open without a network, on a phone and in print."""
+"""HTML pages of results: single files for screens, phones and print, readable offline."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Letters of a name in a figure.
+#: Longest name in a figure [characters].
 _MAX_LABEL_LENGTH = 48
 
+#: CSS of every page.
 STYLE_SHEET = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #d0d0d0; --soft: #f4f4f4; }
 @media (prefers-color-scheme: dark) {
@@ -44,7 +45,7 @@ p.warning, p.fine { border-left: 4px solid #c40; padding: 0.2rem 1rem; } p.fine 
 
 
 def html_document(title: str, elements: Sequence[str]) -> str:
-    """The whole page, of elements."""
+    """A whole page from HTML elements."""
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{html.escape(title)}</title>\n'
@@ -53,17 +54,16 @@ def html_document(title: str, elements: Sequence[str]) -> str:
 
 
 def html_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table that scrolls by itself, of texts and of cells that are HTML already."""
+    """A scrolling table, with headings as text and cells as HTML."""
     head = "".join(f"<th>{html.escape(text)}</th>" for text in headings)
     body = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
 def figure_label(text: str) -> str:
-    """Text that matplotlib takes as it is, and has room for.
+    """A name as literal and short text for matplotlib.
 
-    A name may hold dollar signs, which are not a formula, begin with an underscore, which legends
-    leave out, or be long.
+    Dollar signs start no formula, a leading underscore does not hide it from a legend, and a long name is shortened.
     """
     short = (
         text
@@ -74,11 +74,11 @@ def figure_label(text: str) -> str:
 
 
 def figure_to_svg(figure: Figure) -> str:
-    """A figure as an element of the page."""
+    """A figure as an SVG element of the page."""
     from matplotlib import rc_context
 
     buffer = io.StringIO()
-    # Text stays text, so that it can be searched and read aloud; ids do not depend on the clock.
+    # Text stays text for search and screen readers; ids do not depend on the clock.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": str(np.random.default_rng(0).integers(1 << 30))}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()

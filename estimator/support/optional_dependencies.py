@@ -1,10 +1,10 @@
-"""Packages that only some tasks need, each brought by an extra: ``pip install 'duffing-env[train]'``."""
+"""Optional dependencies: packages that only some tasks need, with the extra of each: ``duffing-env[train]``."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
-#: Name that a package is imported by, to the extra that brings it.
+#: Import name of a package to the extra that installs it.
 EXTRA_OF_PACKAGE = {
     "h5py": "datasets",
     "highspy": "oracle",
@@ -28,10 +28,10 @@ def is_not_installed(package: str) -> bool:
 
 
 def require_packages(*packages: str) -> None:
-    """Refuse to go on without packages that an extra brings, before the work begins.
+    """Refuse to start without packages of an extra.
 
     Raises:
-        ModuleNotFoundError: of the first that is missing, naming its extra.
+        ModuleNotFoundError: naming the first missing package and its extra.
     """
     for package in packages:
         if is_not_installed(package):
@@ -39,5 +39,5 @@ def require_packages(*packages: str) -> None:
 
 
 def install_hint(package: str) -> str:
-    """One line that says which extra brings a package."""
+    """One line with the command that installs a package."""
     return f"{package} is not installed; get it with: pip install 'duffing-env[{EXTRA_OF_PACKAGE[package]}]'"

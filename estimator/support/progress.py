@@ -1,4 +1,4 @@
-"""How far work is, told on stderr: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of long work on stderr: a bar on a terminal, elsewhere a line from time to time."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from contextlib import contextmanager, nullcontext
 
 from estimator.support.argument_checks import mask_control_codes
 
-#: Seconds until the first line where stderr is no terminal, and at least between two.
+#: Shortest time to the first line and between lines, where stderr is no terminal [s].
 REPORT_INTERVAL = 5.0
 
 #: Longest line [characters].
 MAX_LINE_WIDTH = 80
 
-#: Seconds between two looks of a terminal.
+#: Shortest time between two updates of a terminal [s].
 _REDRAW_INTERVAL = 0.2
 
-#: Is told the share of the work that is done, 0 to 1, and what it is at.
+#: Function that receives the share of the work that is done, 0 to 1, and the current step in a few words.
 ProgressCallback = Callable[..., None]
 
 
 def ignore_progress(share: float, current_step: str = "") -> None:
-    """A `ProgressCallback` that keeps it to itself."""
+    """A `ProgressCallback` that prints nothing."""
 
 
 @contextmanager
 def show_progress(title: str = "") -> Iterator[ProgressCallback]:
-    """Show how far the work within is, with the time that is left at the pace so far.
+    """Show the progress of the work in the context, with the remaining time at the pace so far.
 
-    Lines come 5 s apart at first, then ever less often; short work says nothing.
+    Lines are 5 s apart at first, and later farther apart; short work prints nothing.
 
     Args:
-        title: is being done.
+        title: name of the work.
 
     Yields:
-        What is to be told ``(share, at)``, from any thread: the share that is done, 0 to 1, and a few words.
+        A `ProgressCallback`, for any thread: ``(share, current_step)``.
     """
     is_terminal = sys.stderr is not None and sys.stderr.isatty()
     with _terminal_bar() if is_terminal else nullcontext(_print_line) as display:
@@ -45,7 +45,14 @@ def show_progress(title: str = "") -> Iterator[ProgressCallback]:
 
 
 class _ThrottledProgress:
-    """Passes on what is told, seldom enough."""
+    """A `ProgressCallback` that displays at most one line per interval.
+
+    Args:
+        title: name of the work.
+        display: function that displays a share and a line.
+        interval: time between two lines [s].
+        slows_down: whether the interval grows to a quarter of the elapsed time.
+    """
 
     def __init__(self, title: str, display: Callable[[float, str], None], interval: float, slows_down: bool) -> None:
         self._title, self._show, self._interval, self._slows_down = title, display, interval, slows_down
@@ -55,7 +62,7 @@ class _ThrottledProgress:
 
     def __call__(self, share: float, current_step: str = "") -> None:
         now = time.monotonic()
-        if self._first_share is None:  # work that is gone on with has begun before
+        if self._first_share is None:  # resumed work does not start from 0
             self._first_share = share
         if now < self._next_time:
             return
@@ -70,7 +77,7 @@ class _ThrottledProgress:
 
 
 def format_duration(seconds: float) -> str:
-    """In whole seconds, minutes or hours.
+    """A time in whole seconds, minutes or hours.
 
     Example:
         >>> format_duration(3.2), format_duration(160.0), format_duration(10000.0)
@@ -88,7 +95,7 @@ def _print_line(share: float, line: str) -> None:
 
 @contextmanager
 def _terminal_bar() -> Iterator[Callable[[float, str], None]]:
-    """A bar that vanishes in the end."""
+    """A bar that disappears at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -97,4 +104,4 @@ def _terminal_bar() -> Iterator[Callable[[float, str], None]]:
     columns = BarColumn(12), TextColumn("{task.description}", markup=False)
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda share, said: bar.update(task, completed=share, description=said[: console.width - 14])
+        yield lambda share, line: bar.update(task, completed=share, description=line[: console.width - 14])

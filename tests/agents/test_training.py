@@ -343,7 +343,7 @@ def test_a_folder_that_another_trains_in_is_refused_untouched(tmp_path, begin):
     if begin is not train:
         write_json(tmp_path / "run" / "config.json", describe_run(config))
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    with pytest.raises(ValueError, match="must be a folder that nobody else writes to, but another process does"):
+    with pytest.raises(ValueError, match="must be a folder that no other process writes to, but one writes to"):
         begin(config)
     assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
     other.kill()  # the kernel lets go of the folder
@@ -357,7 +357,7 @@ def test_of_two_trainings_in_one_folder_the_second_refuses(tmp_path):
     def second(steps, found):
         with pytest.raises(ValueError, match="output must be a new"):
             tiny(tmp_path / "run", seed=1)
-        with pytest.raises(ValueError, match="resume must be a folder that nobody else writes to"):
+        with pytest.raises(ValueError, match="resume must be a folder that no other process writes to"):
             resume(tmp_path / "run")
         seen.append(steps)
 

@@ -167,7 +167,7 @@ def test_the_result_goes_on(tmp_path, bench):
     assert estimator.belief.parameters()["m"][1] < before
     page = result.report(tmp_path / "folder" / "page.html", ["made <by> this"]).read_text()
     assert "made &lt;by&gt; this" in page
-    assert "2048 samples in 2.048 s; the first 1500 are shown." in page
+    assert "2048 samples in 2.048 s; the figures show the first 1500." in page
     assert page.count("<svg") == 3
     assert "No check speaks against" in page
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://matplotlib.org", "").replace(

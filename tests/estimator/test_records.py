@@ -96,7 +96,7 @@ def test_columns_of_any_name_are_named_in_the_rig(tmp_path):
     for text, message in (
         ("u,y\n5,1\n", r"one column 'Kraft', which the rig's \[input\] names, but has \['u', 'y'\]"),
         ("Kraft,Weg [mm],Weg [mm]\n5,1,2\n", r"one column 'Weg \[mm\]', which the rig's \[output\] names"),
-        ("5,1\n6,2\n", "must name its columns, because the rig does"),
+        ("5,1\n6,2\n", "must name its columns, because the rig names them"),
     ):
         (tmp_path / "other.csv").write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -149,7 +149,7 @@ def test_times_are_even_between_missing_inputs_only(tmp_path):
             "times are 0.5 s apart, but the step is 0.01 s",
         ),
         ("t,u,y\n0,1,2\n0.01,1,3\n0.01,2,3\n", "line 4: times must increase, but 0.01 s comes after 0.01 s"),
-        ("t,u,y\n0,1,2\n,1,3\n0.02,2,3\n", "line 3: there must be a time beside the input, but there is none"),
+        ("t,u,y\n0,1,2\n,1,3\n0.02,2,3\n", "line 3: the input must have a time, but has none"),
         ("t,u,y\n0,,2\n0.01,,3\n", "must have two samples in a row with time and input, but has none"),
         ("t [days],u,y\n0,1,2\n1,1,3\n", "the unit of the times must be one of s, ms, us,"),
         ("", "must hold numbers, but holds none"),
@@ -197,7 +197,7 @@ def test_errors_name_the_record(records, message):
         ("u [kV],y [mm/s]", "'u [kV]' must be in the rig's unit, N, but is in kV; convert the column"),
         ("force [N],velocity [counts]", "'velocity [counts]' must be in the rig's unit, mm/s, but is in counts"),
         ("force [N],displacement [mm/s]", "must be the rig's kind of output, velocity, but is called displacement"),
-        ("Kraft [N],Strom [A],v [mm/s]", "rename: an input is called u, input, force"),
+        ("Kraft [N],Strom [A],v [mm/s]", "rename the input to u, input, force"),
     ],
 )
 def test_names_of_columns_that_contradict_the_rig_are_refused(tmp_path, names, message):

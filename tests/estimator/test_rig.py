@@ -79,7 +79,7 @@ def test_a_saved_rig_is_the_same(rig, tmp_path):
         ({"delay": -1.5}, "delay (for zero_order) must be"),
         (
             {"delay": 0.5, "interpolation": "look_ahead"},
-            "interpolation (for a delay in parts of a sample) must be one of",
+            "interpolation (for a fractional delay) must be one of",
         ),
         ({"input": {"unit": "N", "range": 3.0}}, "input must have no range, but has 3.0; use limit"),
         ({"output": {"unit": "m", "limit": 3.0}}, "output must have no limit, but has 3.0; use range"),

@@ -224,7 +224,7 @@ def read_table(path: Path, input_name: str | None = None, output_name: str | Non
 
     Commas, semicolons, tabs or blanks separate the fields. With semicolons or tabs, in a file without points, 0,5 is
     a number. Empty fields, NaN, NA, N/A, null, none and - are missing; ∞ and inf are over range. Lines that begin
-    with # are skipped; a line of separators alone starts a new record. The line above the numbers may hold names, such as
+    with # are skipped; a line of separators alone starts a new record. The line above the numbers may hold names:
     ``u,y``, ``time [ms],force [N],x [mm]`` or ``time_ms,force_N,x_mm``; or a line of names stands above a line of
     units, such as ``ms,N,mm``. Lines above these are skipped. Numbers without names are the columns u and y, or time in
     seconds, u and y. A column in a unit of time, or of dates or times of day, is the time, whatever its name.
