@@ -1,5 +1,5 @@
-"""Rigs as users have them, simulated by an integrator of the benchmark's own, and `estimator.identify` judged on them.
+"""Benchmarks of `estimator.identify` on rigs of users, simulated by an independent integrator.
 
-``python -m benchmarks.rigs --help`` lists the parts. Nothing of the engine's plant is used: an error that estimator and
-plant share would not show.
+``python -m benchmarks.rigs --help`` lists the parts. The simulation uses nothing of the engine, because an error that
+estimator and plant shared would not show.
 """

@@ -1,4 +1,4 @@
-"""Run a part: ``python -m benchmarks.rigs accuracy --seeds 200``; ``--help`` names the others."""
+"""Command of the rig benchmarks: ``python -m benchmarks.rigs accuracy --seeds 200``; ``--help`` lists the parts."""
 
 import json
 import os
@@ -27,15 +27,15 @@ CORES = os.cpu_count() or 1
 
 @dataclass(frozen=True)
 class OutputConfig:
-    """What is kept of a part."""
+    """Output of a part."""
 
     json: Path | None = None
-    """File for all that came out."""
+    """File for all results."""
 
 
 @dataclass(frozen=True)
 class ParallelConfig(OutputConfig):
-    """A part whose runs are spread over processes."""
+    """A part that runs in several processes."""
 
     workers: int = CORES
     """Processes."""
@@ -60,7 +60,7 @@ class AccuracyConfig(ParallelConfig):
 
 @dataclass(frozen=True)
 class FaultsConfig(ParallelConfig):
-    """Deliberate faults on rigs a and e: the share that is named, and of good records the share that is flagged."""
+    """Deliberate faults on rigs a and e: the share that is named, and the share of good records that is flagged."""
 
     seeds: int = 100
     """Records of each rig and fault."""
@@ -74,14 +74,14 @@ class FaultsConfig(ParallelConfig):
 
 @dataclass(frozen=True)
 class PeersConfig(OutputConfig):
-    """Errors, times and statements against dynamax, SciPy and pysindy, in .venv-peers."""
+    """Errors, times and user statements against dynamax, SciPy and pysindy, in .venv-peers."""
 
     seeds: int = 20
     """Records of each rig."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
     against: tuple[str, ...] = tuple(peer_methods.PEERS)
-    """The others: dynamax as its documentation has it, dynamax-jit by somebody who knows JAX, scipy, pysindy."""
+    """Peers: dynamax as in its documentation, dynamax-jit compiled by a JAX expert, scipy, pysindy."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -107,14 +107,14 @@ class SweepConfig(ParallelConfig):
 
 @dataclass(frozen=True)
 class ClosedLoopConfig(ParallelConfig):
-    """256 samples on the integrator, through Rig-v0 and in blocks, by signals and by the planner."""
+    """Closed-loop runs of 256 samples, through Rig-v0 and in blocks, by signals and by the planner."""
 
     seeds: int = 100
-    """Runs of each rig, policy and way."""
+    """Runs of each rig, policy and mode."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
     policies: tuple[str, ...] = closed_loop.POLICIES
-    """Who chooses: the planner efe, and signals."""
+    """Policies: the planner efe, and signals."""
     ways: tuple[str, ...] = closed_loop.PLAY_MODES
     """Sample by sample, and in blocks of 64."""
 
@@ -127,14 +127,14 @@ class ClosedLoopConfig(ParallelConfig):
 
 @dataclass(frozen=True)
 class UnseenConfig(OutputConfig):
-    """256 samples on six rigs that no network was trained on, by policies for any oscillator and by the planner."""
+    """256 samples on six rigs that no network was trained on, by policies and by the planner."""
 
     seeds: int = 20
     """Episodes of each rig and policy."""
     rigs: tuple[str, ...] = tuple(unseen_rigs.UNSEEN_RIGS)
     """Names of rigs."""
     policies: tuple[str, ...] = ("ppo/universal", "shield", "prbs")
-    """Who chooses, beside the planner efe."""
+    """Policies, beside the planner efe."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -144,16 +144,16 @@ class UnseenConfig(OutputConfig):
 
 @dataclass(frozen=True)
 class ExperimentConfig(ParallelConfig):
-    """The next experiment of 256 samples, designed on a record: what was expected of it beside what came."""
+    """The next experiment of 256 samples, designed on a record: expected and achieved standard deviations."""
 
     seeds: int = 20
     """Experiments of each rig and policy."""
     rigs: tuple[str, ...] = tuple(BENCHES)
     """Names of rigs."""
     policies: tuple[str, ...] = ("efe",)
-    """Who designs."""
+    """Policies that design the experiment."""
     samples: int = 512
-    """Of the record before; 0: designed on the guess, with the noises known."""
+    """Samples of the record before; 0: designed on the guess, with the noises known."""
 
     def run(self) -> dict[str, Any]:
         """Run, print, and return what goes into the file."""
@@ -164,7 +164,7 @@ class ExperimentConfig(ParallelConfig):
 
 @dataclass(frozen=True)
 class RandomRigsConfig(ParallelConfig):
-    """Rigs drawn at random and situations of other people's records, each without a guess."""
+    """Random rigs, and situations of real records, each without a guess."""
 
     classes: tuple[str, ...] = ("rigs",)
     """Classes: rigs, sines, pairs, hammer, wells-velocity, wells-acceleration."""
@@ -194,7 +194,7 @@ BenchmarkConfig = (
 
 @dataclass(frozen=True)
 class Config:
-    """Judge `estimator.identify` on rigs that are simulated by an integrator of the benchmark's own."""
+    """Judge `estimator.identify` on rigs that an independent integrator simulates."""
 
     part: tyro.conf.OmitSubcommandPrefixes[BenchmarkConfig] = field(default_factory=AccuracyConfig)
 

@@ -1,4 +1,4 @@
-"""Verdicts: errors against the Cramér-Rao bound, coverage against its bars, and the trials that give them."""
+"""Calibration of `identify`: errors against the Cramér-Rao bound, coverage of intervals, and trials in processes."""
 
 import tempfile
 import time
@@ -32,16 +32,16 @@ MAX_RATIO_TO_BOUND = 1.2
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """What `identify` made of a record.
+    """The result of `identify` on a record.
 
     Attributes:
-        error: (4,) estimate over truth, less 1; infinite where it failed.
-        deviation: (4,) standard deviations that it states, relative to the truth.
-        inside: (4,) whether its 90 % intervals hold the truth.
-        bound: (4,) Cramér-Rao bound, relative.
-        warnings: name to message.
-        seconds: that it took, with reading the files.
-        failure: what it raised, if anything.
+        error: (4,) relative errors of m, c, a and b; infinite after a failure.
+        deviation: (4,) stated standard deviations, relative to the truth.
+        inside: (4,) whether the 90 % intervals hold the truth.
+        bound: (4,) Cramér-Rao standard deviations, relative to the truth.
+        warnings: name of a warning to its message.
+        seconds: run time with reading of the files [s].
+        failure: type and message of an exception; empty without one.
     """
 
     error: list[float]
@@ -56,9 +56,13 @@ class TrialOutcome:
 def identify_from_files(
     simulated: SimulatedRecord, guess: dict[str, tuple[float, float]] | None, n_pieces: int = 1, **rig_changes: Any
 ) -> TrialOutcome:
-    """Write a record and its rig file, with ``rig_changes`` settings, and identify from these files.
+    """Write a record and its rig file, and identify from these files.
 
-    A record is one file, or several that are ``n_pieces`` of it.
+    Args:
+        simulated: the record.
+        guess: parameter to its 90 % interval, or None.
+        n_pieces: number of files that the record is cut into.
+        rig_changes: settings of the rig file that differ from the truth.
     """
     from estimator import Rig, identify
 
@@ -73,7 +77,7 @@ def identify_from_files(
         started = time.perf_counter()
         try:
             result = identify(Rig.from_file(str(rig_file)), [str(data_file) for data_file in data_files])
-        except Exception as failure:  # whatever a user would meet
+        except Exception as failure:  # any error of a user
             failed = f"{type(failure).__name__}: {failure}"
             return TrialOutcome([np.inf] * 4, [np.nan] * 4, [False] * 4, bound.tolist(), failure=failed)
         seconds = time.perf_counter() - started
@@ -89,9 +93,9 @@ def identify_from_files(
 
 
 def compare_to_truth(
-    parameters: Mapping[str, Sequence[float]], intervals: Mapping[str, tuple[float, float]], truth: FloatArray
+    parameters: Mapping[str, tuple[Any, ...]], intervals: Mapping[str, tuple[float, float]], truth: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of m, c, a and b: relative errors (4,), standard deviations (4,), and whether the intervals hold the truth."""
+    """Relative errors (4,) of m, c, a and b, standard deviations (4,), and whether intervals hold the truth (4,)."""
     mean, std = np.array([parameters[name][:2] for name in PARAMETERS]).T
     low, high = np.array([intervals[name] for name in PARAMETERS]).T
     return mean / truth - 1, std, (low <= truth) & (truth <= high)
@@ -99,7 +103,13 @@ def compare_to_truth(
 
 @dataclass(frozen=True)
 class BenchmarkCell:
-    """Outcomes of one rig in one setting, judged by parameter."""
+    """The outcomes of one bench in one setting.
+
+    Attributes:
+        bench: the bench.
+        setting: name of the setting.
+        outcomes: one outcome per seed.
+    """
 
     bench: Bench
     setting: str
@@ -107,12 +117,12 @@ class BenchmarkCell:
 
     @property
     def errors(self) -> FloatArray:
-        """(4,) medians of the relative errors."""
+        """(4,) medians of the absolute relative errors."""
         return np.asarray(np.median(np.abs([outcome.error for outcome in self.outcomes]), axis=0))
 
     @property
     def error_bars(self) -> FloatArray:
-        """(4,) what the errors may be: 0.3 %, or 1.2 times the median Cramér-Rao deviation where that is more."""
+        """(4,) largest errors that pass: 0.3 %, or 1.2 times the median Cramér-Rao deviation where that is more."""
         return np.maximum(MIN_ERROR_BAR, MAX_RATIO_TO_BOUND * self.bounds)
 
     @property
@@ -122,11 +132,11 @@ class BenchmarkCell:
 
     @property
     def hits(self) -> list[int]:
-        """(4,) outcomes whose intervals hold the truth."""
+        """(4,) numbers of outcomes whose intervals hold the truth."""
         return np.sum([outcome.inside for outcome in self.outcomes], axis=0).tolist()
 
     def to_dict(self) -> dict[str, Any]:
-        """For the JSON file."""
+        """The cell for a JSON file."""
         return {
             "rig": self.bench.name,
             "setting": self.setting,
@@ -138,7 +148,7 @@ class BenchmarkCell:
 
 
 def judge_coverage(hits: Sequence[int], trials: Sequence[int]) -> tuple[float, list[bool], bool]:
-    """Pooled coverage, whether each cell's 99.9 % binomial interval meets 0.85 to 0.95, and whether all is well.
+    """Pooled coverage, whether each cell's 99.9 % binomial interval meets 0.85 to 0.95, and whether both bars pass.
 
     Example:
         >>> judge_coverage([180, 190, 120], [200, 200, 200])
@@ -153,7 +163,7 @@ def judge_coverage(hits: Sequence[int], trials: Sequence[int]) -> tuple[float, l
 
 
 def binomial_interval(count: int, number: int, level: float = 0.999) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share."""
+    """Clopper-Pearson interval of a share, ``count`` of ``number``."""
     from scipy.stats import binomtest
 
     interval = binomtest(count, number).proportion_ci(level, "exact")
@@ -167,9 +177,17 @@ Answer = TypeVar("Answer")
 def run_in_processes(
     work: Callable[[Any], Answer], cells: Sequence[CellName], seeds: int, workers: int, title: str
 ) -> dict[CellName, list[Answer]]:
-    """Cell to the answers of all its seeds, with a bar on stderr; the first task runs alone, because it compiles.
+    """Run a function on every cell and seed in processes; the first task runs alone, because it compiles.
 
-    A task, which ``work`` is given, is what names the cell, and a seed.
+    Args:
+        work: function of a task, which is a cell's name followed by a seed.
+        cells: names of the cells.
+        seeds: number of seeds.
+        workers: number of processes.
+        title: of the progress bar on stderr.
+
+    Returns:
+        Name of a cell to the results of its seeds.
     """
     from rich.console import Console
     from rich.progress import track

@@ -1,4 +1,4 @@
-"""The closed loop: 256 samples on the adaptive integrator, by signals and by the planner, one by one and in blocks."""
+"""Closed-loop benchmark: 256 samples on a simulated bench, by signals and the planner, by samples and in blocks."""
 
 import tempfile
 from collections.abc import Sequence
@@ -37,20 +37,20 @@ N_SAMPLES = 256
 #: Samples of a block.
 BLOCK_SAMPLES = 64
 
-#: Share of runs that may leave the range, of which the upper end of the 95 % interval must stay below.
+#: Share of the runs that leave the range: the upper end of its 95 % interval, at most.
 MAX_RANGE_EXIT_RATE = 0.05
 
-#: Between two blocks an unknown time passes: up to so many samples.
+#: Longest pause between two blocks, whose length is unknown [samples].
 _MAX_PAUSE_SAMPLES = 200
 
 
 class BenchPlant:
-    """A bench as a plant: of ``Rig-v0`` by `reset` and `step`, of a run in blocks by the others.
+    """A bench as a plant: `reset` and `step` for ``Rig-v0``, the other methods for a run in blocks.
 
-    The input is held over each sample, and the force is disturbed.
+    The input is held over each sample, and the force has a disturbance.
 
     Args:
-        bench: which.
+        bench: the bench.
         seed: of its noises.
     """
 
@@ -61,11 +61,11 @@ class BenchPlant:
         self.reset()
 
     def reset(self) -> None:
-        """To rest, without input."""
+        """Put the oscillator to rest, without input."""
         self._state, self._acceleration = np.array([self._bench.rest, 0.0]), 0.0
 
     def step(self, u: float) -> float:
-        """Hold an input for a sample; what the sensor shows at its end."""
+        """Hold an input for a sample, and return the output at its end."""
         bench = self._bench
         force = np.array([u + bench.process_noise * self._rng.standard_normal()])
         states, ends = simulate(bench.parameters, force, np.zeros(1), self._state, bench.step, bench.scale)
@@ -73,7 +73,7 @@ class BenchPlant:
         return self._sensor_output()
 
     def play(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """After a pause: inputs (N,) as they are, and the outputs as each began."""
+        """Play inputs (N,) after a pause; return them, and the output at the begin of each."""
         for _ in range(1 + self._rng.integers(_MAX_PAUSE_SAMPLES)):
             self.step(0.0)
         shown = self._sensor_output()
@@ -81,11 +81,24 @@ class BenchPlant:
         return u, np.array(outputs[:-1])
 
     def arm(self, watchdog: float | None) -> None:
-        """Nothing is to do: blocks end with no input."""
+        """Do nothing: every block ends without input."""
 
-    zero = disarm = apply = read = lambda self, *told: None
+    def zero(self) -> None:
+        """Do nothing: every block ends without input."""
+
+    def disarm(self) -> None:
+        """Do nothing: every block ends without input."""
+
+    def apply(self, u: float) -> float:
+        """Refuse single inputs: the plant plays blocks."""
+        raise NotImplementedError
+
+    def read(self) -> float:
+        """Refuse single outputs: the plant plays blocks."""
+        raise NotImplementedError
 
     def _sensor_output(self) -> float:
+        """The present output, with offset and noise."""
         bench = self._bench
         clean = (*self._state, self._acceleration)[SENSOR_KINDS.index(bench.kind)]
         return float(clean + bench.offset + bench.sensor_noise * self._rng.standard_normal())
@@ -93,15 +106,15 @@ class BenchPlant:
 
 @dataclass(frozen=True)
 class LoopOutcome:
-    """What a policy made of one run.
+    """The result of one closed-loop run.
 
     Attributes:
         gain: information about the coefficients that the posterior has gained [nats].
         inside: (4,) whether the 90 % intervals of m, c, a and b hold the truth.
-        error: (4,) of the estimates, relative.
-        narrower: (4,) standard deviations before over those after.
-        left: whether the output left its range, or the numbers ran away.
-        refused: whether a block was refused, because even silence might have left the range; the run ends there.
+        error: (4,) relative errors of the estimates.
+        narrower: (4,) standard deviations before over standard deviations after.
+        left: whether the output left its range, or the simulation diverged.
+        refused: whether the run ended because no block was safe, not even without input.
     """
 
     gain: float
@@ -113,12 +126,12 @@ class LoopOutcome:
 
 
 def with_held_input(name: str) -> Bench:
-    """A rig whose input is held, and that does not decimate."""
+    """A bench with a held input and without decimation."""
     return replace(BENCHES[name], decimate=1, interpolation="zero_order")
 
 
 def rig_of_bench(bench: Bench, seed: int, with_noises: bool = False) -> Rig:
-    """The rig of a bench whose input is held, with a guess that is off; with its noises, or without."""
+    """The rig of a bench with a held input, with a guess that is off, and with or without its noises."""
     return Rig(
         bench.step,
         input=Channel(bench.units[0], limit=bench.limit, noise=bench.process_noise if with_noises else None),
@@ -129,7 +142,7 @@ def rig_of_bench(bench: Bench, seed: int, with_noises: bool = False) -> Rig:
 
 
 def run_trial(task: tuple[str, str, str, int]) -> LoopOutcome:
-    """Play 256 samples on a rig by a policy."""
+    """Play 256 samples on a bench by a policy; the task is bench, policy, mode and seed."""
     name, policy, mode, seed = task
     bench = with_held_input(name)
     rig = rig_of_bench(bench, seed)
@@ -150,7 +163,7 @@ def run_trial(task: tuple[str, str, str, int]) -> LoopOutcome:
 
 
 def _play_samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, max_input: float) -> tuple[Belief, str]:
-    """Sample by sample through ``Rig-v0``: the belief at the end, and what ended the run, as of one in blocks."""
+    """Play sample by sample through ``Rig-v0``; return the belief at the end, and the reason of the end."""
     import gymnasium as gym
 
     import duffing_env  # noqa: F401  registers the tracks
@@ -165,11 +178,12 @@ def _play_samples(rig: Rig, plant: BenchPlant, policy: str, seed: int, max_input
         begins = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, _ = env.step(action)
         done = terminated or truncated
-    return env.unwrapped.belief, "range" if terminated else "complete"
+    unwrapped: Any = env.unwrapped
+    return unwrapped.belief, "range" if terminated else "complete"
 
 
 def _play_blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, max_input: float) -> tuple[Belief, str]:
-    """In blocks, as ``duffing-env run`` scales them: each has its share of what a run is allowed."""
+    """Play in blocks as ``duffing-env run`` does; each block has its share of the exit probability of a run."""
     from agents.hardware.clock import JumpingClock
     from agents.hardware.experiment_run import RunSettings, run_experiment
 
@@ -186,12 +200,12 @@ def _play_blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, max_input:
 def run_trials(
     names: Sequence[str], policies: Sequence[str], modes: Sequence[str], seeds: int, workers: int
 ) -> dict[tuple[str, str, str], list[LoopOutcome]]:
-    """Runs by rig, policy and way."""
+    """Runs by bench, policy and mode."""
     return run_in_processes(run_trial, list(product(names, policies, modes)), seeds, workers, "Playing")
 
 
 def print_report(runs: dict[tuple[str, str, str], list[LoopOutcome]]) -> dict[str, Any]:
-    """Print the table and the verdicts by way; return these for the JSON file."""
+    """Print the table and the verdicts by mode; return the verdicts for the JSON file."""
     rows = []
     for (name, policy, mode), found in runs.items():
         gains, number = np.array([one.gain for one in found]), len(found)
@@ -211,7 +225,7 @@ def print_report(runs: dict[tuple[str, str, str], list[LoopOutcome]]) -> dict[st
 
 
 def judge_mode(runs: dict[tuple[str, str, str], list[LoopOutcome]], mode: str) -> dict[str, Any]:
-    """What the runs of a way say of the intervals, of what the planner learns, and of how often it leaves the range."""
+    """Verdict of a mode: calibration of the intervals, information and range exits of the planner."""
     hits, trials, is_within_limits, is_efe_ahead = [], [], [], []
     for (name, policy, played_mode), found in runs.items():
         if played_mode != mode:

@@ -1,4 +1,4 @@
-"""The next experiment, designed, played and identified: what was expected beside what came."""
+"""Designed experiments: expected and achieved standard deviations of the next experiment, after a record."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,18 +13,19 @@ from benchmarks.rigs.calibration import INTERVAL_PROBABILITY, binomial_interval,
 from benchmarks.rigs.closed_loop import MAX_RANGE_EXIT_RATE, N_SAMPLES, BenchPlant, rig_of_bench, with_held_input
 from benchmarks.rigs.simulated_records import simulate_record
 
-#: Seeds of the noises of a second experiment: those of the first, and so much.
+#: Difference between the noise seeds of the second and the first experiment.
 _SECOND_SEED_OFFSET = 1_000_000
 
 
 @dataclass(frozen=True)
 class ExperimentOutcome:
-    """What came of one experiment.
+    """The result of one experiment; all standard deviations are of m, c, a and b, relative to the truth.
 
     Attributes:
-        before, expected, after: (4,) standard deviations of m, c, a and b, relative to the truth: before it, expected
-            after it, and as `identify` states them after it, from both records.
-        error: (4,) of the estimates after it, relative.
+        before: (4,) standard deviations before the experiment.
+        expected: (4,) standard deviations that the design expects after it.
+        after: (4,) standard deviations that `identify` states after it, from both records.
+        error: (4,) relative errors of the estimates after it.
         inside: (4,) whether the 90 % intervals hold the truth.
         left: whether the output left its range.
     """
@@ -38,7 +39,7 @@ class ExperimentOutcome:
 
 
 def run_trial(task: tuple[str, str, int, int]) -> ExperimentOutcome:
-    """A record of some samples, or none; the next experiment by a policy; its answer; and both identified."""
+    """Design an experiment after a record, play it, identify from both; the task is bench, policy, samples, seed."""
     from agents.hardware.next_experiment import design_experiment
     from estimator import identify
 
@@ -55,16 +56,15 @@ def run_trial(task: tuple[str, str, int, int]) -> ExperimentOutcome:
     error, std, inside = compare_to_truth(result.parameters, result.interval(INTERVAL_PROBABILITY), truth)
     before = np.array([found.prior.parameters()[p][1] for p in PARAMETERS])
     expected = np.array([found.expected_stds[p] for p in PARAMETERS])
-    return ExperimentOutcome(
-        *((np.asarray(stds) / np.abs(truth)).tolist() for stds in (before, expected, std)),
-        error.tolist(), inside.tolist(), bool((np.abs(y) > bench.output_range).any()),
-    )  # fmt: skip
+    left = bool((np.abs(y) > bench.output_range).any())
+    before, expected, after = (np.asarray(stds) / np.abs(truth) for stds in (before, expected, std))
+    return ExperimentOutcome(before.tolist(), expected.tolist(), after.tolist(), error.tolist(), inside.tolist(), left)
 
 
 def run_trials(
     names: Sequence[str], policies: Sequence[str], samples: int, seeds: int, workers: int
 ) -> dict[tuple[str, str], list[ExperimentOutcome]]:
-    """Trials by rig and policy."""
+    """Trials by bench and policy."""
     cells = [(name, policy, samples) for name in names for policy in policies]
     trials = run_in_processes(run_trial, cells, seeds, workers, "Designing")
     return {(name, policy): of_cell for (name, policy, _), of_cell in trials.items()}

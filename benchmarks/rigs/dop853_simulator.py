@@ -1,7 +1,7 @@
-"""m x'' + c x' + a x + b x³ + q x⁵ = u + w, integrated from sample to sample by Dormand and Prince's method of order 8.
+"""Simulation of m x'' + c x' + a x + b x³ + q x⁵ = u + w by the Dormand-Prince method of order 8, with sensitivities.
 
-The coefficients and the control of the step are those of SciPy's ``DOP853``. The force is a polynomial between two
-samples, so that every sample begins a new integration and no step crosses a jump of the force.
+Coefficients and step control are from SciPy's ``DOP853``. The force is a polynomial between two samples; every sample
+starts a new integration, so that no step crosses a jump of the force.
 """
 
 from typing import Any
@@ -13,9 +13,11 @@ from scipy.integrate import DOP853
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Kinds of a sensor, by the order of the time derivative.
 SENSOR_KINDS = ("displacement", "velocity", "acceleration")
 
-#: Directions of `state_sensitivities`: the state at the sample's begin, the held process noise, and the parameters, each relative.
+#: Directions of `state_sensitivities`: the state at the begin of the sample, the held process noise, and the logarithms
+#: of the parameters.
 SENSITIVITY_DIRECTIONS = ("x", "v", "w", "m", "c", "a", "b")
 
 #: Relative tolerance of a step.
@@ -50,7 +52,7 @@ def _state_derivative(tau, s, p, force, slope, out):
 
 @njit(cache=True)
 def _advance_sample(s, p, force, slope, step, scale, h, K, new):
-    """Move ``s`` over a sample; the step size to begin the next one with."""
+    """Integrate ``s`` over a sample, and return the first step size of the next one."""
     tau = 0.0
     n = len(s)
     _state_derivative(0.0, s, p, force, slope, K[0])
@@ -117,9 +119,9 @@ def _simulate(p, force, slope, initial, step, scale):
 
 @njit(cache=True)
 def state_sensitivities(p, force, slope, states, step, scale):
-    """(T, 7, 2) derivatives of the state after each interval, from the state before it, in each of `SENSITIVITY_DIRECTIONS`.
+    """(T, 7, 2) derivatives of the state after each sample interval by each of `SENSITIVITY_DIRECTIONS` before it.
 
-    In a parameter: times the parameter, which is a derivative by its logarithm. Arguments are those of `simulate`.
+    The other arguments are as in `simulate`; ``states`` (T, 2) are the states before the intervals.
     """
     sensitivities = np.empty((len(force), 7, 2))
     s = np.empty(16)
@@ -145,11 +147,11 @@ def simulate(
         slope: (T,) its rate of change over the interval.
         initial: (2,) x and x' at sample 0.
         step: sampling step.
-        scale: (2,) sizes of x and x'; errors are at most of the order of 1e-12 of them, or 1e-9 of the values.
+        scale: (2,) sizes of x and x'; errors are of the order of 1e-12 of them, or 1e-9 of the values, at most.
 
     Returns:
-        The states (T + 1, 2), and the acceleration (T + 1,) at the end of the interval that leads to each sample, of
-        which none leads to sample 0: no force acts there.
+        The states (T + 1, 2), and the accelerations (T + 1,) at the end of the interval before each sample. No interval
+        precedes sample 0, where no force acts.
 
     Raises:
         OverflowError: where the oscillator escapes.
@@ -161,7 +163,7 @@ def simulate(
 
 
 def output_derivatives(sensor_kind: str, parameters: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(T, 2) derivatives of each output by the state, and (T,) of an acceleration by the force."""
+    """(T, 2) derivatives of each output by the state, and (T,) derivatives of an acceleration by the force, else 0."""
     m, c, a, b, q = parameters
     rows: Any = {"displacement": (1.0, 0.0), "velocity": (0.0, 1.0), "acceleration": (0.0, -c / m)}[sensor_kind]
     by_state = np.tile(np.array(rows), (len(states), 1))

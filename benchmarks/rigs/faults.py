@@ -1,4 +1,4 @@
-"""Faults that users meet, put into records of rigs a and e on purpose: are they named, is a good record left alone?"""
+"""Detection of faults: deliberate faults in records of rigs a and e, and false alarms on good records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,9 +13,10 @@ from benchmarks.rigs.calibration import TrialOutcome, identify_from_files, run_i
 from benchmarks.rigs.rig_accuracy import count_warnings
 from benchmarks.rigs.simulated_records import SimulatedRecord, draw_guess, rng_stream, simulate_record
 
+#: Name to bench.
 FAULT_BENCHES = {"a": DESK_BENCH, "e": SILVERBOX_HELD}
 
-#: Fault to the names of the warnings that are right for it.
+#: Fault to the warnings that are right for it.
 EXPECTED: dict[str, tuple[str, ...]] = {
     "none": (),
     "one sample late": ("delay",),
@@ -36,7 +37,9 @@ INPUT_NOISE_FRACTION = 0.05
 
 #: Quintic force at the peak, as a fraction of the cubic force there.
 QUINTIC_FRACTION = 0.2
-#: Of the amplitude: no record of a hundred can then tell b to better than 75 %, but m, c and a to 10 %, by the bound.
+
+#: Weak input, as a fraction of the amplitude: by the bound of a hundred records, b is open by 75 % or more, and m, c
+#: and a are known to 10 %.
 WEAK_AMPLITUDE_FRACTION = 0.01
 #: Share of the faults that are named, at least.
 MIN_DETECTION_RATE = 0.95
@@ -46,7 +49,7 @@ MAX_FALSE_ALARM_RATE = 0.05
 
 
 def make_faulty_record(fault: str, name: str, seed: int) -> tuple[SimulatedRecord, dict[str, Any]]:
-    """A record with a fault, and what is wrong in its rig file."""
+    """A record with a fault, and the wrong settings of its rig file."""
     bench = FAULT_BENCHES[name]
     clean = simulate_record(bench, seed)
     if fault == "one sample late":
@@ -66,7 +69,6 @@ def make_faulty_record(fault: str, name: str, seed: int) -> tuple[SimulatedRecor
     if fault == "step half as long":
         return clean, {"step": bench.step / 2}
     if fault == "quintic stiffness":
-        # Of the cubic force at the peak of the record without it.
         return simulate_record(
             replace(bench, quintic=QUINTIC_FRACTION * bench.truth[3] / np.abs(clean.states[:, 0]).max() ** 2), seed
         ), {}
@@ -76,26 +78,26 @@ def make_faulty_record(fault: str, name: str, seed: int) -> tuple[SimulatedRecor
 
 
 def run_trial(task: tuple[str, str, int]) -> TrialOutcome:
-    """Identify one record with a fault; the rig file has a guess."""
+    """Identify one record with a fault and a guess; the task is fault, bench and seed."""
     fault, name, seed = task
     faulty, rig_changes = make_faulty_record(fault, name, seed)
     return identify_from_files(faulty, draw_guess(FAULT_BENCHES[name], seed), **rig_changes)
 
 
 def run_trials(chosen: Sequence[str], seeds: int, workers: int) -> dict[tuple[str, str], list[TrialOutcome]]:
-    """(fault, rig) to the outcomes of all seeds."""
+    """Outcomes by fault and bench."""
     return run_in_processes(run_trial, list(product(chosen, FAULT_BENCHES)), seeds, workers, "Identifying")
 
 
 def detection_rate(fault: str, outcomes: Sequence[TrialOutcome]) -> float:
-    """Share of records whose fault is named; of those without one, the share that is flagged by anything."""
+    """Share of the records whose fault is named; without a fault, the share with any warning."""
     if not EXPECTED[fault]:
         return float(np.mean([bool(outcome.warnings) for outcome in outcomes]))
     return float(np.mean([not set(EXPECTED[fault]).isdisjoint(outcome.warnings) for outcome in outcomes]))
 
 
 def passes_bar(fault: str, share: float) -> bool:
-    """Whether a share clears its bar."""
+    """Whether a share passes its bar."""
     return share >= MIN_DETECTION_RATE if EXPECTED[fault] else share <= MAX_FALSE_ALARM_RATE
 
 

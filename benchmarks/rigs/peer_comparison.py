@@ -1,4 +1,4 @@
-"""`identify` against what people use today, on the same records: errors, times, and statements that a user writes."""
+"""Comparison of `identify` with other methods on the same records: errors, run times, and statements of user code."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ from benchmarks.rigs.bench_catalogue import BENCHES
 from benchmarks.rigs.dop853_simulator import FloatArray
 from benchmarks.rigs.simulated_records import draw_guess, simulate_record, write_record, write_rig
 
+#: Name of our method.
 OURS = "identify"
-#: Geometric mean of our error over theirs, at most; how much slower dynamax must be, at least; statements of ours.
+
+#: Peer to the geometric mean of our error over its error, at most.
 MAX_ERROR_RATIO = {"dynamax": 1.1, "dynamax-jit": 1.1, "scipy": 1.0, "pysindy": 1.0}
+
 #: Peers whose times are compared.
 TIMED_PEERS = ("dynamax", "dynamax-jit")
 
@@ -35,22 +38,25 @@ MIN_TIME_RATIO = 5.0
 #: Statements that a user of `identify` writes, at most.
 MAX_STATEMENTS = 5
 
-_STEPS_PER_PERIOD = 64  # of the peers' integration
-_N_SCRIPT_RUNS = 5  # of Python, for the time of a whole script
+#: Integration steps of the peers per period.
+_STEPS_PER_PERIOD = 64
+
+#: Runs of a whole script, for its median time.
+_N_SCRIPT_RUNS = 5
 
 
 def ours(rig_file: str, data_file: str) -> dict[str, tuple[float, float]]:
-    """All that a user of `identify` writes."""
+    """The code of a user of `identify`."""
     from estimator import Rig, identify
 
     return identify(Rig.from_file(rig_file), [data_file]).parameters
 
 
 def script_time_ratios(names: Sequence[str], peer_names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """How many times as long as ours each other's script takes for one record of each rig, from the start of Python.
+    """Peer and bench to the time of its script over ours, for one record, from the start of Python.
 
-    In turns, ratios of medians. Before it begins, both have been run once: ours finds its kernels compiled on disk, JAX
-    compiles anew, as both do for whoever runs a script again. Empty where the peers are not available.
+    The ratios are of medians over alternating runs. A first run of each does not count: afterwards our kernels are
+    compiled on disk, whereas JAX compiles in every run. Empty where the peers are not available.
     """
     ratios: dict[str, dict[str, float]] = {method: {} for method in peer_names}
     with tempfile.TemporaryDirectory() as folder:
@@ -98,12 +104,12 @@ def count_statements(*functions: Callable[..., Any]) -> int:
 
 
 def write_problems(path: Path, names: Sequence[str], seeds: int) -> None:
-    """What the peers get of each rig: records, guesses, and the true noises."""
+    """Write the problems for the peers: records, guesses and true noises of each bench."""
     arrays: dict[str, Any] = {}
     for name in names:
         bench = BENCHES[name]
         made = [simulate_record(bench, seed) for seed in range(seeds)]
-        # Where a filter has averaged over several samples of a process, its noise is told as it is after that.
+        # A decimation filter averages over several samples: the peers get the noises after it.
         root = np.sqrt(bench.decimate)
         fields = {
             "u": np.stack([one.u for one in made]),
@@ -119,10 +125,7 @@ def write_problems(path: Path, names: Sequence[str], seeds: int) -> None:
 
 
 def run_comparison(names: Sequence[str], seeds: int, peer_names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Rig and method, ours and those ``peer_names`` it, to errors (seeds, 4) and seconds (seeds,), in turns.
-
-    Or to the reason why there are none.
-    """
+    """Bench and method to errors (seeds, 4), seconds (seeds,) and reasons of failures, for all methods in turns."""
     from rich.console import Console
     from rich.progress import track
 
@@ -148,6 +151,7 @@ def run_comparison(names: Sequence[str], seeds: int, peer_names: Sequence[str]) 
 
 
 def _identify_one(method: str, name: str, seed: int, folder: Path, peers: Peers) -> tuple[FloatArray, float]:
+    """Parameters (4,) and run time [s] of a method on one record."""
     if method != OURS:
         answer = peers.ask(f"rigs {method} {name}", seed)
         return np.array(answer["parameters"]), answer["seconds"]
@@ -164,7 +168,7 @@ def _identify_one(method: str, name: str, seed: int, folder: Path, peers: Peers)
 def error_ratio(our_errors: Any, their_errors: Any) -> tuple[float, float]:
     """Geometric mean, over seeds and parameters, of our errors over theirs, and the factor of its 95 % interval.
 
-    Both NaN where they have none.
+    Both are NaN where the peer has no errors.
     """
     logs = np.log(np.array(our_errors)) - np.log(np.array(their_errors))
     is_finite = np.isfinite(logs)
@@ -175,7 +179,7 @@ def error_ratio(our_errors: Any, their_errors: Any) -> tuple[float, float]:
 
 
 def print_report(results: dict[str, dict[str, Any]], script_ratios: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Print the table and the verdict, with what `script_time_ratios` found; return the verdict for the JSON file."""
+    """Print the table, the script times and the verdict; return the verdict for the JSON file."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -233,5 +237,5 @@ def print_report(results: dict[str, dict[str, Any]], script_ratios: dict[str, di
 
 
 def first_and_other_seconds(method_results: dict[str, Any]) -> tuple[float, float]:
-    """Of a rig's first record, for which a peer may compile, and the median of the others."""
+    """Run time of a bench's first record, which may include a compilation, and the median of the others [s]."""
     return float(method_results["seconds"][0]), float(np.nanmedian(method_results["seconds"][1:] or [np.nan]))

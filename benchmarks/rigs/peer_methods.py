@@ -1,7 +1,7 @@
-"""What a user of dynamax, SciPy or pysindy writes for a rig. Runs in the peers' environment, and imports none of ours.
+"""Identification by dynamax, SciPy and pysindy, as a user would write it; runs in the environment of the peers.
 
-Each function takes a `PeerProblem` and returns m, c, a and b. All begin at the guess, and know the rest at the start, the
-interpolation of the input, and whether the sensor has an offset.
+Each method takes a `PeerProblem` and returns m, c, a and b. All start from the guess, and know the initial state, the
+interpolation of the input, and whether the sensor has an offset. This module imports nothing of the project.
 """
 
 # The peers are not installed where types are checked.
@@ -17,14 +17,26 @@ from typing import Any
 
 import numpy as np
 
-SEGMENT_LENGTHS = (32, 256)  # samples
+#: Lengths of the segments of multiple shooting, in order [samples].
+SEGMENT_LENGTHS = (32, 256)
 
 
 @dataclass(frozen=True)
 class PeerProblem:
-    """A record and what its user knows. Arrays of NumPy, numbers in the units of the rig.
+    """A record and the knowledge of its user, in the units of the rig.
 
-    ``substeps`` of Runge and Kutta's method a sample are enough.
+    Attributes:
+        u: (T,) inputs.
+        y: (T,) outputs.
+        step: sampling step [s].
+        kind: kind of the output.
+        interpolation: interpolation of the input.
+        substeps: Runge-Kutta steps per sample that are enough.
+        offset: whether the sensor has an offset.
+        rest: displacement at rest at the start.
+        guess: (4,) guess of m, c, a and b.
+        process_noise: standard deviation of the force's disturbance per sample.
+        sensor_noise: standard deviation of the sensor's noise.
     """
 
     u: Any
@@ -41,7 +53,7 @@ class PeerProblem:
 
 
 def inputs_at_substeps(problem: PeerProblem) -> Any:
-    """(T, 2 S + 1) inputs at the ends and middles of S substeps from each sample to the next."""
+    """(T, 2 S + 1) inputs at the ends and midpoints of S substeps from each sample to the next."""
     from scipy.interpolate import make_interp_spline
 
     u, substeps = problem.u, problem.substeps
@@ -52,7 +64,7 @@ def inputs_at_substeps(problem: PeerProblem) -> Any:
 
 
 def rk4_sample(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
-    """Displacement and velocity a sample later; p are 1/m, c/m, a/m and b/m."""
+    """Displacement and velocity one sample later; p are 1/m, c/m, a/m and b/m."""
     h = 2 * step / (len(forces) - 1)
     for s in range(0, len(forces) - 1, 2):
         x, v = rk4_substep(x, v, p, forces[s : s + 3], h)
@@ -60,7 +72,7 @@ def rk4_sample(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, A
 
 
 def rk4_substep(x: Any, v: Any, p: Any, forces: Any, h: float) -> tuple[Any, Any]:
-    """One of Runge and Kutta's steps, h seconds long, under the inputs at its start, middle and end."""
+    """One Runge-Kutta step of h seconds, with the inputs at its start, midpoint and end."""
     first, middle, last = (p[0] * force for force in forces)
     k1 = first - p[1] * v - p[2] * x - p[3] * x**3
     x2, v2 = x + h / 2 * v, v + h / 2 * k1
@@ -73,7 +85,7 @@ def rk4_substep(x: Any, v: Any, p: Any, forces: Any, h: float) -> tuple[Any, Any
 
 
 def to_physical_parameters(p: Any) -> Any:
-    """m, c, a and b of 1/m, c/m, a/m and b/m."""
+    """m, c, a and b from 1/m, c/m, a/m and b/m."""
     return np.array([1.0, p[1], p[2], p[3]]) / p[0]
 
 
@@ -87,7 +99,7 @@ def initial_guess(problem: PeerProblem) -> tuple[Any, float, float]:
 
 
 def run_filter(problem: PeerProblem, kalman_filter: Callable[..., Any]) -> Any:
-    """What a filter (`dynamax_filter`) makes of a record, told the true noises."""
+    """Parameters by a filter (`dynamax_filter`) over a record, with the true noises."""
     import jax
     import jax.numpy as jnp
 
@@ -99,7 +111,7 @@ def run_filter(problem: PeerProblem, kalman_filter: Callable[..., Any]) -> Any:
     sensor = problem.sensor_noise**2 + (
         (guess[0] * problem.process_noise) ** 2 if problem.kind == "acceleration" else 0.0
     )
-    # It conditions on a sample before it takes that sample's inputs: those that led to it, then.
+    # The filter conditions on an output before it applies the inputs of that sample: so these precede the output.
     inputs = np.roll(inputs_at_substeps(problem), 1, axis=0)
     given = (mean, np.diag(std**2), np.outer(kick, kick) + 1e-24 * np.eye(7), np.array([[sensor]]), scale,
              problem.y[:, None], inputs)  # fmt: skip
@@ -108,7 +120,7 @@ def run_filter(problem: PeerProblem, kalman_filter: Callable[..., Any]) -> Any:
 
 
 def dynamax_filter(kind: str, step: float, propagate: Callable[..., Any]) -> Callable[..., Any]:
-    """The filter of dynamax, of a joint state (x, v, four coefficients, sensor offset), each in a unit of its own."""
+    """The filter of dynamax for the scaled joint state (x, v, four coefficients, sensor offset)."""
     import jax.numpy as jnp
     from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
 
@@ -130,34 +142,34 @@ def dynamax_filter(kind: str, step: float, propagate: Callable[..., Any]) -> Cal
 
 
 def dynamax(problem: PeerProblem) -> Any:
-    """The extended Kalman filter of dynamax, called as in its documentation, about the steps that SciPy takes, too."""
+    """The extended Kalman filter of dynamax, called as in its documentation."""
     return run_filter(problem, dynamax_filter(problem.kind, problem.step, rk4_sample))
 
 
 def dynamax_jit(problem: PeerProblem) -> Any:
-    """The same by somebody who knows JAX: it loops over the steps itself, and keeps what it compiled for a rig."""
+    """The same as a JAX expert would write it: with a loop in JAX, and compiled once for a rig."""
     return run_filter(problem, jitted_dynamax_filter(problem.kind, problem.step))
 
 
 @cache
 def jitted_dynamax_filter(kind: str, step: float) -> Callable[..., Any]:
-    """A filter that JAX compiles as a whole."""
+    """A filter that JAX compiles as a whole, once for a rig."""
     import jax
 
     return jax.jit(dynamax_filter(kind, step, rk4_sample_scan))
 
 
 def rk4_sample_scan(x: Any, v: Any, p: Any, forces: Any, step: float) -> tuple[Any, Any]:
-    """As `rk4_sample`, by a loop of JAX's own: it compiles steps for seconds where they stand one after the other."""
+    """`rk4_sample` with a loop in JAX, which would take seconds to compile the steps one by one."""
     import jax
 
     h = 2 * step / (len(forces) - 1)
     triples = jax.numpy.stack([forces[:-1:2], forces[1::2], forces[2::2]], axis=1)
-    return jax.lax.scan(lambda xv, three: (rk4_substep(*xv, p, three, h), None), (x, v), triples)[0]
+    return jax.lax.scan(lambda xv, three: (rk4_substep(xv[0], xv[1], p, three, h), None), (x, v), triples)[0]
 
 
 def multiple_shooting(problem: PeerProblem) -> Any:
-    """SciPy's least squares over coefficients and the start of every segment, from short segments to longer ones."""
+    """Multiple shooting: SciPy's least squares over coefficients and the initial state of every segment."""
     guess = problem.guess
     for length in SEGMENT_LENGTHS:
         guess = fit_segments(replace(problem, guess=guess), length)
@@ -165,7 +177,7 @@ def multiple_shooting(problem: PeerProblem) -> Any:
 
 
 def fit_segments(problem: PeerProblem, segment_length: int) -> Any:
-    """The same, with segments of one length."""
+    """Multiple shooting with segments of one length."""
     from scipy.optimize import least_squares
 
     guess, size, speed = initial_guess(problem)
@@ -215,7 +227,7 @@ def fit_segments(problem: PeerProblem, segment_length: int) -> Any:
 
 
 def pysindy(problem: PeerProblem) -> Any:
-    """Sparse regression on derivatives by Savitzky and Golay's filter, told which terms there are."""
+    """Regression by pysindy on derivatives by a Savitzky-Golay filter, with the true terms."""
     import pysindy as ps
     from scipy.signal import savgol_filter
 
@@ -245,7 +257,7 @@ def pysindy(problem: PeerProblem) -> Any:
 
 PEERS = {"dynamax": dynamax, "dynamax-jit": dynamax_jit, "scipy": multiple_shooting, "pysindy": pysindy}
 
-#: What a user writes for each, beside its own function.
+#: Peer to the functions that its user writes, besides its own.
 HELPERS: dict[str, tuple[Callable[..., Any], ...]] = {
     "dynamax": (
         inputs_at_substeps,
@@ -272,7 +284,7 @@ HELPERS: dict[str, tuple[Callable[..., Any], ...]] = {
 
 
 def row(given: dict[str, Any], peer: str, rig: str) -> Callable[[int], dict[str, Any]]:
-    """A row: ``run(i)`` identifies the i-th record of a rig, and says how long that took."""
+    """A function of i that identifies the i-th record of a rig, and returns the parameters and the run time."""
 
     def run(i: int) -> dict[str, Any]:
         fields = {name: given[f"{rig}_{name}"] for name in PeerProblem.__dataclass_fields__}

@@ -1,10 +1,10 @@
-"""Rigs drawn at random, and situations of other people's records: what `identify` makes of each without a guess.
+"""`identify` without a guess on random rigs, and on records in difficult situations.
 
-``draw_rig`` are hardening, softening or of two wells, seen by displacement, velocity or acceleration, driven by a binary
-signal or a sweep, with noises and converters as instruments have them. The other classes are records that leave
-something open, or begin in quiet: one settled sine, two of them, hammer blows, and two wells alone.
+The rigs have a hardening, a softening or a two-well spring, a sensor of displacement, velocity or acceleration, a
+binary input or a sweep, and the noises and converters of instruments. The other classes are records that leave
+parameters open or begin at rest: one settled sine, two of them, hammer blows, and two wells alone.
 
-The same seed gives the same record, on every machine and at every commit.
+The same seed gives the same record on every machine and in every version.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ from benchmarks.rigs.dop853_simulator import SENSOR_KINDS, FloatArray, simulate
 from estimator.rigs.channel import Channel
 from estimator.rigs.rig import Rig
 
+#: Springs of the random rigs.
 SPRINGS = ("hardening", "softening", "wells")
+
+#: Kind of an output to its SI unit.
 UNIT_OF_KIND = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 
 #: Samples of a record of a random rig.
@@ -33,22 +36,22 @@ N_SAMPLES = 4000
 #: Samples of a record of a settled sine.
 N_SINE_SAMPLES = 4000
 
-#: A result is right where each of m, c, a and b is within this many of its standard deviations.
+#: Largest error of each parameter in a right result, in stated standard deviations.
 MAX_RIGHT_STDS = 4.0
 
-#: Deviation of a sensor of the other situations, in parts of the output's.
+#: Standard deviation of the sensor noise in the other classes, relative to the output.
 SENSOR_NOISE_FRACTION = 0.002
 
 
 @dataclass(frozen=True)
 class RandomRig:
-    """A rig and what was recorded of it.
+    """A rig and its records.
 
     Attributes:
-        truth: m, c, a and b, in SI units.
-        rig: as a user describes it, without a guess.
-        records: pairs of inputs and outputs (T,).
-        description: the rig, in words.
+        truth: true m, c, a and b, in SI units.
+        rig: the rig as a user describes it, without a guess.
+        records: pairs of inputs (T,) and outputs (T,).
+        description: the rig in words.
     """
 
     truth: tuple[float, float, float, float]
@@ -59,16 +62,16 @@ class RandomRig:
 
 @dataclass(frozen=True)
 class IdentificationOutcome:
-    """What `identify` made of it.
+    """The result of `identify` on a random rig.
 
     Attributes:
-        error: (4,) estimate over truth, less 1.
-        z: (4,) estimate less truth, in stated standard deviations.
+        error: (4,) relative errors of m, c, a and b.
+        z: (4,) errors in stated standard deviations.
         inside: (4,) whether the 90 % intervals hold the truth.
-        warnings: names.
+        warnings: names of the warnings.
         open: parameters that are named as not identified.
-        seconds: that it took.
-        failure: what it raised, if anything.
+        seconds: run time [s].
+        failure: message of an exception; empty without one.
     """
 
     error: list[float]
@@ -86,26 +89,33 @@ class IdentificationOutcome:
 
 
 def _seeded_rng(class_name: str, seed: int) -> np.random.Generator:
+    """Random numbers of a class and a seed."""
     return np.random.default_rng([seed, *class_name.encode()])
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A random number that is uniform in the logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def _quantise(values: FloatArray, bits: int) -> FloatArray:
-    """As a converter gives them whose range is 1.2 times the largest."""
+    """Values quantised by a converter whose range is 1.2 times the largest value."""
     step = 2.4 * np.abs(values).max() / 2**bits
     return np.asarray(step * np.round(values / step))
 
 
 def _rest_displacement(truth: Sequence[float]) -> float:
+    """Displacement at rest: of two wells, the right one."""
     return math.sqrt(-truth[2] / truth[3]) if truth[2] < 0 else 0.0
 
 
 def _simulate_output(truth: tuple[float, float, float, float], u: FloatArray, w: FloatArray, step: float, kind: str,
             linear: bool = False, start: tuple[float, float] | None = None) -> FloatArray:  # fmt: skip
-    """Outputs (T,) of inputs (T,) and disturbances (T,) that are held, or go linearly; it may leave by overflow."""
+    """Outputs (T,) for inputs (T,), held or linear, and held disturbances (T,).
+
+    Raises:
+        OverflowError: where the oscillator escapes.
+    """
     size = max(np.abs(u).max() / max(abs(truth[2]), 1e-12), 1e-9)
     slope = np.diff(u) / step if linear else np.zeros(len(u) - 1)
     states, ends = simulate(
@@ -116,10 +126,15 @@ def _simulate_output(truth: tuple[float, float, float, float], u: FloatArray, w:
 
 
 def draw_rig(seed: int, spring: str = "", kind: str = "") -> RandomRig:
-    """A rig of a seed: springs and sensors take turns, unless they are given.
+    """A random rig with 14 to 100 samples per period, a damping ratio of 0.003 to 0.15, and typical instruments.
 
-    14 to 100 samples in a period, a damping ratio of 0.003 to 0.15, sensor noise of 0.015 to 2.7 % of the output,
-    disturbances of 0.03 to 2.7 % of the input's, converters of 12, 14 or 16 bits.
+    The sensor noise is 0.015 to 2.7 % of the output, the disturbance 0.03 to 2.7 % of the input, and the converter has
+    12, 14 or 16 bits.
+
+    Args:
+        seed: of the random numbers, and of spring and sensor where these are empty.
+        spring: one of `SPRINGS`.
+        kind: kind of the output.
     """
     spring, kind = spring or SPRINGS[seed % 3], kind or SENSOR_KINDS[seed // 3 % 3]
     for attempt in range(200):
@@ -128,13 +143,14 @@ def draw_rig(seed: int, spring: str = "", kind: str = "") -> RandomRig:
         per_period, zeta = _log_uniform(rng, 14.0, 100.0), _log_uniform(rng, 0.003, 0.15)
         w0, step = 2 * np.pi * frequency, 1 / (frequency * per_period)
         stiffness, size = m * w0**2, _log_uniform(rng, 1e-4, 1e-2)
-        # The cubic force at the size, in parts of the linear one there; two wells are one size apart from the hill.
+        # The cubic force relative to the linear force at the size; two wells are one size away from the hill.
         part = rng.uniform(0.1, 0.8)
         a = {"wells": -stiffness / 2}.get(spring, stiffness)
         b = {"hardening": part, "softening": -0.3 * part, "wells": 0.5}[spring] * stiffness / size**2
         truth = (m, 2 * zeta * m * w0, a, b)
         if rng.random() < 0.5:
-            hold = int(rng.integers(max(2, per_period / 8), per_period / 3 + 3))
+            shortest, longest = max(2, per_period / 8), per_period / 3 + 3
+            hold = int(rng.integers(shortest, longest))  # type: ignore[call-overload]
             shape, u = "binary", np.repeat(rng.choice([-1.0, 1.0], N_SAMPLES // hold + 1), hold)[:N_SAMPLES]
         else:
             times = np.arange(N_SAMPLES) / N_SAMPLES
@@ -168,7 +184,7 @@ def _draw_oscillator(rng: np.random.Generator) -> tuple[tuple[float, float, floa
 
 
 def _settling_sine(truth: tuple[float, ...], w0: float, amplitude: float, part: float, phase: float) -> FloatArray:
-    """Inputs of a sine, 20 times as long as it takes to settle before the last `N_SINE_SAMPLES`."""
+    """Inputs of a sine, with 20 time constants of the decay before the last `N_SINE_SAMPLES`."""
     m, c, _, _ = truth
     before = int(20 * m / c / 1e-3)
     times = 1e-3 * (np.arange(before + N_SINE_SAMPLES) - before)
@@ -176,9 +192,9 @@ def _settling_sine(truth: tuple[float, ...], w0: float, amplitude: float, part: 
 
 
 def draw_settled_sines(seed: int, count: int = 1) -> RandomRig:
-    """Settled sines of small and middle amplitude, 0.5 to 1.3 times the frequency of small oscillations.
+    """One or two settled sines of moderate amplitude, at 0.5 to 1.3 times the frequency of small oscillations.
 
-    Two of them have amplitudes that differ by a factor of 2 to 4, and one frequency.
+    Two sines have the same frequency, and amplitudes that differ by a factor of 2 to 4.
     """
     rng = _seeded_rng("sines", seed)
     truth, w0 = _draw_oscillator(rng)
@@ -193,12 +209,12 @@ def draw_settled_sines(seed: int, count: int = 1) -> RandomRig:
 
 
 def draw_two_sines(seed: int) -> RandomRig:
-    """Two settled sines of other amplitudes."""
+    """Two settled sines of different amplitudes."""
     return draw_settled_sines(seed, 2)
 
 
 def draw_hammer_blows(seed: int) -> RandomRig:
-    """Four blows of 3 ms in 3 s, by vibrometer and by accelerometer in turns, at 8 to 16 kHz."""
+    """Four hammer blows of 3 ms in 3 s, measured by vibrometer or accelerometer in turns, at 8 to 16 kHz."""
     rng = _seeded_rng("hammer", seed)
     kind, truth = ("velocity", "acceleration")[seed % 2], _draw_oscillator(rng)[0]
     rate = float(rng.choice([8e3, 1e4, 12.8e3, 16e3]))
@@ -213,7 +229,7 @@ def draw_hammer_blows(seed: int) -> RandomRig:
     return RandomRig(truth, rig, ((u, y),), f"{kind}, {rate:g} Hz")
 
 
-#: Class to what draws it.
+#: Class to the function that draws a rig from a seed.
 RECORD_CLASSES: dict[str, Callable[[int], RandomRig]] = {
     "rigs": draw_rig,
     "sines": draw_settled_sines,
@@ -225,7 +241,7 @@ RECORD_CLASSES: dict[str, Callable[[int], RandomRig]] = {
 
 
 def run_trial(task: tuple[str, int]) -> IdentificationOutcome:
-    """Draw and identify."""
+    """Draw a rig and identify it; the task is class and seed."""
     from estimator import identify
 
     name, seed = task
@@ -247,18 +263,19 @@ def run_trial(task: tuple[str, int]) -> IdentificationOutcome:
 
 
 def run_trials(classes: Sequence[str], count: int, first: int, workers: int) -> dict[str, list[IdentificationOutcome]]:
-    """Class to the answers of the seeds from ``first`` on."""
+    """Class to the outcomes of ``count`` seeds from ``first`` on."""
     tasks = [(name, seed) for name in classes for seed in range(first, first + count)]
     found = run_in_processes(_run_task, tasks, 1, workers, "Identifying")
     return {name: [found[name, seed][0] for seed in range(first, first + count)] for name in classes}
 
 
 def _run_task(task: tuple[str, int, int]) -> IdentificationOutcome:
+    """`run_trial` for `run_in_processes`, which adds a seed."""
     return run_trial(task[:2])
 
 
 def print_report(found: dict[str, list[IdentificationOutcome]], first: int) -> dict[str, Any]:
-    """Print a row for each class, and of ``draw_rig`` for each spring and sensor; return the rows for the JSON file."""
+    """Print a row for each class, and for each spring and sensor of random rigs; return the rows for the JSON file."""
     rows = dict[str, list[IdentificationOutcome]]()
     for name, answers in found.items():
         rows[name] = answers
@@ -278,9 +295,9 @@ def print_report(found: dict[str, list[IdentificationOutcome]], first: int) -> d
 
 
 def summarise(answers: Sequence[IdentificationOutcome]) -> dict[str, Any]:
-    """Counts; coverage of the 90 % intervals of m, c, a and b among results without a warning; median errors."""
+    """Counts, coverage of the 90 % intervals among results without a warning, and median errors."""
     silent = [one for one in answers if not one.warnings and not one.failure]
-    # What is named as open is no claim.
+    # A parameter that is named as not identified is no claim.
     claims = [hit for one in answers if set(one.warnings) <= {"not_identified"} and not one.failure
               for p, hit in zip(PARAMETERS, one.inside, strict=True) if p not in one.open]  # fmt: skip
     return {

@@ -1,4 +1,4 @@
-"""Errors and coverage of `identify` on every rig, from a CSV and a rig file, with a guess, without, and in pieces."""
+"""Errors and coverage of `identify` on every bench, from CSV and rig files: with a guess, without, and in pieces."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,7 +25,7 @@ N_PIECES = 16
 
 
 def run_trial(task: tuple[str, tuple[str, ...], int]) -> list[TrialOutcome]:
-    """Simulate one record of a rig, of a seed, and identify it in each of some settings."""
+    """Simulate one record and identify it in each setting; the task is bench, settings and seed."""
     name, settings, seed = task
     bench = BENCHES[name]
     simulated = simulate_record(bench, seed)
@@ -35,7 +35,7 @@ def run_trial(task: tuple[str, tuple[str, ...], int]) -> list[TrialOutcome]:
 
 
 def run_trials(names: Sequence[str], settings: Sequence[str], seeds: int, workers: int) -> list[BenchmarkCell]:
-    """A cell for each rig and setting."""
+    """A cell for each bench and setting."""
     outcomes = run_in_processes(run_trial, [(name, tuple(settings)) for name in names], seeds, workers, "Identifying")
     return [
         BenchmarkCell(BENCHES[name], setting, [of_seed[place] for of_seed in found])
@@ -74,18 +74,19 @@ def print_report(cells: Sequence[BenchmarkCell]) -> dict[str, Any]:
         console_output.format_table(titles, rows, markdown=True),
         f"{'PASS' if verdict['accurate'] else 'MISS'}: median errors at most 0.3 %, or 1.2 times the median bound\n"
         f"{'PASS' if is_calibrated else 'MISS'}: calibrated; pooled coverage {pooled:.3f} "
-        f"({POOLED_COVERAGE_BAR[0]} to {POOLED_COVERAGE_BAR[1]}), {verdict['cells outside']} of {len(meets)} cells outside of 0.85 to 0.95",
+        f"({POOLED_COVERAGE_BAR[0]} to {POOLED_COVERAGE_BAR[1]}), {verdict['cells outside']} of {len(meets)} cells "
+        f"outside of 0.85 to 0.95",
     )
     return verdict
 
 
 def format_percents(values: Any) -> str:
-    """Numbers as percents, two digits each."""
+    """Numbers as percents, with two digits each."""
     return ", ".join(f"{100 * value:.2g}" for value in values)
 
 
 def count_warnings(outcomes: Sequence[TrialOutcome]) -> str:
-    """How many of the records met which warnings, and which failures."""
+    """Warnings and failures with the number of records that have them."""
     counts: dict[str, int] = {}
     for outcome in outcomes:
         for name in [*outcome.warnings, *([outcome.failure[:60]] if outcome.failure else [])]:

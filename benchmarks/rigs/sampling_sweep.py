@@ -1,4 +1,4 @@
-"""From 6 to 800 samples per period, from the linear range to the limit: no overflow, calibrated, nothing invented."""
+"""Sweep over 6 to 800 samples per period and over the amplitude: failures, calibration, and false identifiability."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,8 +19,10 @@ from benchmarks.rigs.calibration import (
 from benchmarks.rigs.rig_accuracy import count_warnings, format_percents
 from benchmarks.rigs.simulated_records import draw_guess, simulate_record
 
+#: Samples per period of the sweep.
 SAMPLES_PER_PERIOD = (6, 12, 25, 50, 100, 200, 400, 800)
-#: Of rig a's limit.
+
+#: Amplitudes of the sweep, as fractions of the limit of rig a.
 AMPLITUDE_FRACTIONS = (0.001, 0.01, 0.1, 0.5, 1.0)
 
 #: Relative Cramér-Rao deviation from which a parameter is out of reach.
@@ -28,6 +30,8 @@ MIN_OPEN_BOUND = 0.5
 
 #: Relative Cramér-Rao deviation up to which a parameter is within reach; between the two either verdict is right.
 MAX_IDENTIFIABLE_BOUND = 0.1
+
+#: Name of the warning for parameters out of reach.
 NOT_IDENTIFIED = "not_identified"
 #: Share of the records out of reach that are reported, at least.
 MIN_DETECTION_RATE = 0.95
@@ -37,9 +41,13 @@ MAX_FALSE_ALARM_RATE = 0.05
 
 
 def bench_with_sampling(samples_per_period: int, amplitude: float) -> Bench:
-    """Rig a, sampled so, with an input of this share of its limit: held for a quarter of a period, at least a sample.
+    """Rig a at another sampling rate and amplitude, with an input that is held for a quarter of a period.
 
-    The process noise has the same power in each second.
+    The input is held for one sample at least. The power density of the process noise stays the same.
+
+    Args:
+        samples_per_period: sampling rate.
+        amplitude: of the input, as a fraction of the limit.
     """
     step = DESK_BENCH.samples_per_period * DESK_BENCH.step / samples_per_period
     return replace(
@@ -54,7 +62,7 @@ def bench_with_sampling(samples_per_period: int, amplitude: float) -> Bench:
 
 
 def run_trial(task: tuple[int, float, int]) -> TrialOutcome:
-    """Identify one record, with a guess for even seeds and without for odd ones."""
+    """Identify one record, with a guess for even seeds; the task is samples per period, amplitude and seed."""
     per_period, amplitude, seed = task
     chosen = bench_with_sampling(per_period, amplitude)
     return identify_from_files(simulate_record(chosen, seed), None if seed % 2 else draw_guess(chosen, seed))
@@ -72,7 +80,7 @@ def run_trials(seeds: int, workers: int) -> list[BenchmarkCell]:
 
 
 def is_said_open(outcomes: Sequence[TrialOutcome]) -> tuple[list[bool], list[bool]]:
-    """Of what is out of reach, whether that is said; of what is within it, whether the contrary is.
+    """Whether each parameter out of reach is named as not identified, and whether each parameter within reach is.
 
     A warning begins with the names of the parameters.
     """

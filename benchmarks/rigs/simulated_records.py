@@ -1,9 +1,8 @@
-"""Records of the rigs: what a user's instrument would write, the rig file, and what the record could tell at best.
+"""Simulated records of the benches, their files, and the Cramér-Rao bound of m, c, a and b.
 
-That is the Cramér-Rao bound of m, c, a and b from one record, the noises known and the state at its start unknown. The
-sensitivities of the outputs, taken along the path that the oscillator went, are whitened by the Kalman filter of the
-linearised motion. What the noises' dependence on the parameters would add is left out: it does not grow as noises
-shrink.
+The bound is of one record with known noises and an unknown initial state. The sensitivities of the outputs along the
+true path are whitened by the Kalman filter of the linearised motion. The information in the noises' dependence on the
+parameters is left out, because it does not grow as the noises shrink.
 """
 
 from dataclasses import dataclass
@@ -23,22 +22,28 @@ from benchmarks.rigs.dop853_simulator import (
     state_sensitivities,
 )
 
+#: Largest relative error of a guess.
 MAX_GUESS_ERROR = 0.3
-#: Recorded samples that are cut at either end of what a filter has gone over.
+
+#: Recorded samples that are cut at either end of a filtered record.
 _FILTER_MARGIN = 100
+
+#: Stream of random numbers to its number in the seed.
 _RNG_STREAMS = {"input": 0, "noise": 1, "guess": 2, "fault": 3}
 
 
 @dataclass(frozen=True)
 class SimulatedRecord:
-    """What is recorded of a rig, and the path that it went.
+    """A record of a bench, and the true motion.
 
     Attributes:
-        bench: of which rig.
-        u, y: (T,) as recorded.
+        bench: the bench.
+        u: (T,) recorded inputs.
+        y: (T,) recorded outputs.
         states: (N, 2) x and x' at each sample of the integration.
-        force, slope: (N - 1,) what acted.
-        accelerations: (N,) accelerations; see `simulate`.
+        force: (N - 1,) force at the begin of each interval.
+        slope: (N - 1,) its rate of change.
+        accelerations: (N,) accelerations; see `benchmarks.rigs.dop853_simulator.simulate`.
     """
 
     bench: Bench
@@ -51,9 +56,9 @@ class SimulatedRecord:
 
     @cached_property
     def cramer_rao_stds(self) -> FloatArray:
-        """(4,) Cramér-Rao bound of m, c, a and b, relative; a sensor's offset is unknown where there is one.
+        """(4,) Cramér-Rao standard deviations of m, c, a and b, relative, with an unknown offset where there is one.
 
-        Of a rig that decimates, that of the record before its filter.
+        With decimation, the bound is of the record before the filter.
         """
         bench = self.bench
         step = bench.step / bench.decimate
@@ -76,16 +81,16 @@ class SimulatedRecord:
 def fisher_information(
     sensitivities, output_by_state, output_by_force, output_by_unknown, process_variance, sensor_variance, initial_std
 ):
-    """Fisher information of P unknowns, of which the four parameters come first.
+    """Fisher information of P unknowns, with the four parameters first.
 
     Args:
-        sensitivities: (T, 7, 2) of `simulator.paths`.
+        sensitivities: (T, 7, 2) sensitivities of `benchmarks.rigs.dop853_simulator.state_sensitivities`.
         output_by_state: (T + 1, 2) derivatives of the outputs by the state.
-        output_by_force: (T + 1,) by the process noise that acted before.
-        output_by_unknown: (T + 1, P) by the unknowns, at a given state.
-        process_variance: variance of the force held over a sample.
+        output_by_force: (T + 1,) derivatives by the process noise before the output.
+        output_by_unknown: (T + 1, P) derivatives by the unknowns, at a given state.
+        process_variance: variance of the disturbance that is held over a sample.
         sensor_variance: variance of the sensor's noise.
-        initial_std: (2,) standard deviations of the state at the start.
+        initial_std: (2,) standard deviations of the initial state.
     """
     unknowns = output_by_unknown.shape[1]
     fisher = np.zeros((unknowns, unknowns))
@@ -115,7 +120,7 @@ def fisher_information(
 
 
 def cramer_rao_stds(fisher: FloatArray) -> FloatArray:
-    """(4,) least standard deviations of m, c, a and b, relative to each; the other unknowns are marginalised."""
+    """(4,) smallest relative standard deviations of m, c, a and b, with the other unknowns marginalised."""
     scale = np.sqrt(np.diag(fisher))
     if not (scale > 0).all():
         return np.full(4, np.inf)
@@ -124,7 +129,7 @@ def cramer_rao_stds(fisher: FloatArray) -> FloatArray:
 
 
 def rng_stream(bench: Bench, seed: int, stream: str) -> np.random.Generator:
-    """Random numbers of a rig and a seed; faults and noises leave the others' as they are."""
+    """Random numbers of a bench, a seed and a stream: input, noise, guess or fault."""
     return np.random.default_rng([seed, _RNG_STREAMS[stream], *bench.name.encode()])
 
 
@@ -134,11 +139,14 @@ def simulate_record(
     """Simulate a record from rest.
 
     Args:
-        bench: the rig.
+        bench: the bench.
         seed: of input and noises.
-        n_samples: recorded.
-        extra_delay: samples by which the input acts later than is recorded.
-        interpolation: as it is: ``zero_order``, or ``linear``.
+        n_samples: recorded samples.
+        extra_delay: delay of the acting input after the recorded one [samples].
+        interpolation: true interpolation: ``zero_order`` or ``linear``.
+
+    Raises:
+        OverflowError: where the oscillator escapes, or leaves the range.
     """
     margin = _FILTER_MARGIN if bench.decimate > 1 else 0
     u = bench.excitation(rng_stream(bench, seed, "input"), n_samples + 2 * margin)
@@ -154,7 +162,7 @@ def simulate_record(
     if np.abs(y).max() > bench.output_range:
         raise OverflowError(f"rig {bench.name} leaves its range: {np.abs(y).max():.3g} of {bench.output_range}")
     kept = slice(margin, margin + n_samples)
-    if bench.decimate > 1:  # an input that is held stands, at the instant of a sample, between the last value and this
+    if bench.decimate > 1:  # at a sample, a held input is between the previous and the present value
         u = (np.r_[u[0], u[:-1]] + u) / 2
     return SimulatedRecord(
         bench, decimate(u, bench.decimate)[kept], decimate(y, bench.decimate)[kept], states, force, slope, ends
@@ -162,10 +170,7 @@ def simulate_record(
 
 
 def decimate(series: FloatArray, factor: int) -> FloatArray:
-    """Every ``factor``-th sample, behind a long anti-alias filter without delay: for inputs and outputs alike.
-
-    The page of the beam says why.
-    """
+    """Every ``factor``-th sample after an anti-alias filter without delay, of an input or output (docs/rig_beam.md)."""
     if factor == 1:
         return series
     from scipy.signal import firwin, resample_poly
@@ -178,19 +183,19 @@ def decimate(series: FloatArray, factor: int) -> FloatArray:
 
 
 def draw_guess(bench: Bench, seed: int) -> dict[str, tuple[float, float]]:
-    """Intervals of ±30 % about guesses that are off by up to ±30 %."""
+    """Guess: intervals of ±30 % about centers that are off by up to ±30 %."""
     error_factors = 1 + rng_stream(bench, seed, "guess").uniform(-MAX_GUESS_ERROR, MAX_GUESS_ERROR, len(PARAMETERS))
     centers = dict(zip(PARAMETERS, (np.array(bench.truth) * error_factors).tolist(), strict=True))
     return {name: tuple(sorted((0.7 * center, 1.3 * center))) for name, center in centers.items()}
 
 
 def write_record(path: Path, u: FloatArray, y: FloatArray) -> None:
-    """A CSV file with a header and 10 digits."""
+    """Write a CSV file with a header and 10 digits."""
     np.savetxt(path, np.column_stack([u, y]), fmt="%.10g", delimiter=",", header="u,y", comments="")
 
 
 def write_rig(path: Path, bench: Bench, intervals: dict[str, tuple[float, float]] | None, **rig_changes: Any) -> None:
-    """The rig file, as a user would write it; ``rig_changes`` replaces step or interpolation."""
+    """Write the rig file as a user would; ``rig_changes`` replace step or interpolation."""
     settings: dict[str, Any] = {"step": bench.step, "interpolation": bench.interpolation, "delay": 0} | rig_changes
     lines = [f"{name} = {value!r}" for name, value in settings.items()]
     lines += ["", "[input]", f'unit = "{bench.units[0]}"', f"limit = {bench.limit!r}"]

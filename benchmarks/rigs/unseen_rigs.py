@@ -1,7 +1,7 @@
-"""Six rigs that no network was trained on: what policies for any oscillator are worth there, beside the planner.
+"""Information gain of policies for any oscillator, relative to the planner, on six rigs that no network was trained on.
 
-They were drawn (NumPy's generator 67) and committed before `ppo/universal` was trained. Each is played on its simulated
-twin, ``Rig-v0``, for 256 samples, with the noises unknown.
+The rigs are random, and older than `ppo/universal`. Each episode is 256 samples on the simulated twin, ``Rig-v0``, with
+unknown noises.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from estimator.rigs.channel import Channel
 from estimator.rigs.rig import Rig
 from research.studies.unseen_oscillators import PLANNER, play_episode
 
+#: Name to rig.
 UNSEEN_RIGS = {
     "softening": Rig(
         1e-3, input=Channel("N", limit=27.0, noise=0.11), output=Channel("m", range=0.00268, noise=3.04e-6),
@@ -45,12 +46,12 @@ UNSEEN_RIGS = {
     ),
 }  # fmt: skip
 
-#: Coefficients of the belief: m, c, a, b, and the offsets of input and output.
+#: Number of coefficients of the belief: m, c, a, b, and the offsets of input and output.
 _N_COEFFICIENTS = 6
 
 
 def run_episodes(names: Sequence[str], policies: Sequence[str], seeds: int) -> dict[str, dict[str, list[float]]]:
-    """Information gained [nats] in each episode, by rig and policy; the planner's comes first."""
+    """Information gain of each episode [nats], by rig and policy, with the planner first."""
     information_gain: dict[str, dict[str, list[float]]] = {}
     for name in names:
         member = FamilyMember(name, 0.0, 0.0, 0.0, {"rig": UNSEEN_RIGS[name], "horizon": 256})
@@ -61,7 +62,7 @@ def run_episodes(names: Sequence[str], policies: Sequence[str], seeds: int) -> d
 
 
 def print_report(information_gain: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    """Print the table; gives exp(2 Δ / K) of the mean information beside the planner, by rig and policy."""
+    """Print the table; return the D-efficiency exp(2 Δ / K) relative to the planner, by rig and policy."""
     d_efficiency: dict[str, Any] = {}
     rows = []
     for name, found in information_gain.items():
@@ -72,7 +73,7 @@ def print_report(information_gain: dict[str, dict[str, list[float]]]) -> dict[st
         )
     policies = list(next(iter(information_gain.values())))[1:]
     console_output.print_texts_and_tables(
-        "nats, and in brackets the D-efficiency beside efe",
+        "nats, and in brackets the D-efficiency relative to efe",
         console_output.format_table(("rig", PLANNER, *policies), rows, markdown=True),
     )
     return d_efficiency

@@ -220,6 +220,6 @@ def test_an_inverse_that_undoes_nothing_is_refused():
     # At a step of a second nobody would see it.
     heat = Model("heat", **HEAT, dimensions=DIMENSIONS, inverse={"gain": "step/cap", "loss": "cond/cap"})
     coefficients_of(heat, {"cap": 50.0, "cond": 2.0}, Scales(1.0))
-    message = "by that of 'heat' cond=2 is loss=0.04, gain=0.04, and by physical these are cond=1 again"
+    message = "the inverse of 'heat' turns cond=2 into loss=0.04, gain=0.04, and physical turns these into cond=1"
     with pytest.raises(ValueError, match=message):
         coefficients_of(heat, {"cap": 50.0, "cond": 2.0}, Scales(2.0))
