@@ -217,7 +217,7 @@ def simulate(
     """
     n, samples = u.shape
     known = dict(zip(model.coefficients, coefficients.T, strict=True)) | {"sqrt": np.sqrt}
-    moves = [compile(text, model.name, "eval") for text in model.moves]
+    moves = [compile(text, model.name, "eval") for text in model.update_expressions]
     shown = compile(next(iter(model.outputs.values())), model.name, "eval")
     strengths = [eval(text, {"sqrt": np.sqrt}) for text in model.noise]
     state = np.zeros((model.n_states, n)) if start is None else start.T.copy()

@@ -90,7 +90,7 @@ class OnlineEstimator:
         expectations: str | None = None,
         noise_hypotheses: NoiseGridSize | None = None,
     ) -> None:
-        rig = None if rig is None else Rig.of(rig)
+        rig = None if rig is None else Rig.from_any(rig)
         rig_brings_prior = rig is not None and rig.guess is not None and model is None and prior is None
         if rig_brings_prior:
             assert rig is not None

@@ -125,7 +125,7 @@ def run_experiment(
         >>> bool(abs(mean - 0.42) < 4 * std < 0.04)
         True
     """
-    rig, settings, clock = Rig.of(rig), settings or RunSettings(), clock or RealClock()
+    rig, settings, clock = Rig.from_any(rig), settings or RunSettings(), clock or RealClock()
     plant, on_progress = check_plant(plant), on_progress or (lambda samples: None)
     run_estimator, watchdog_timeout = RunEstimator(rig, prior), settings.watchdog_timeout(rig.step)
     check_safety_settings(rig, plant, watchdog_timeout)

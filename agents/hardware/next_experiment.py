@@ -142,7 +142,7 @@ def design_experiment(
     check_integer("samples", samples, _MAX_SAMPLES, 8)
     check_number("bound", bound, MIN_MAGNITUDE, 1 - MIN_MAGNITUDE, "0.05 is usual")
     check_integer("seed", seed, MAX_SEED, 0)
-    rig = Rig.of(rig)
+    rig = Rig.from_any(rig)
     belief = rig_prior(rig) if prior is None else prior
     env_view = EnvView(rig, belief, int(samples))
     rng = np.random.default_rng(seed)

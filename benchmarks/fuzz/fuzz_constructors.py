@@ -123,7 +123,9 @@ def calls() -> st.SearchStrategy[Call]:
         if draw(st.integers(0, 9)) == 0:
             described = draw(changed(RIG.to_dict()))
             return Call(
-                "Rig.of", lambda: Rig.of(described), ("rig", *Rig.__dataclass_fields__, *Channel.__dataclass_fields__)
+                "Rig.from_any",
+                lambda: Rig.from_any(described),
+                ("rig", *Rig.__dataclass_fields__, *Channel.__dataclass_fields__),
             )
         if draw(st.integers(0, 19)) == 0:
             value = draw(anything)

@@ -38,7 +38,7 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
     A column is dead where its pivot is within `PIVOT_TOLERANCE` of the variance. P is not a covariance where a pivot is
     below that, or a dead column still goes along with another quantity.
     """
-    names, m = cubature_order(model), len(model.movers)
+    names, m = cubature_order(model), len(model.dynamic_names)
     covariance = lambda i, j: symmetric_entry("P", i, j, model.names)  # noqa: E731
     lines: Assignments = []
 
@@ -80,7 +80,7 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
 
 def point_names(model: Model) -> dict[str, str]:
     """Names of the movers at a point."""
-    return {i: f"M_{i}" if i in model.states else f"X_{i}" for i in model.movers}
+    return {i: f"M_{i}" if i in model.states else f"X_{i}" for i in model.dynamic_names}
 
 
 def place_point(model: Model) -> tuple[Assignments, dict[str, str]]:
@@ -106,7 +106,7 @@ def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str
 
 def point_moments(model: Model) -> tuple[Assignments, Propagation]:
     """Mean and covariance Q of the images, without process noise, whose covariance is that at the mean."""
-    states, m = list(model.states), len(model.movers)
+    states, m = list(model.states), len(model.dynamic_names)
     lines: Assignments = []
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]
     image = lambda p, i: symbol(f"I_{p}_{i}")  # noqa: E731

@@ -176,7 +176,7 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
 
 def _loop_over_points(model: Model, before: str, body: str) -> str:
     """Source of ``update(W)`` over all sigma points."""
-    head = f"@scalar_jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.movers)}):\n"
+    head = f"@scalar_jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.dynamic_names)}):\n"
     return head + body + "    finish(W)\n"
 
 

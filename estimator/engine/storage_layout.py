@@ -32,7 +32,7 @@ def integrator_rows(model: Model) -> list[str]:
     """
     if not model.is_continuous:
         return []
-    names = [f"M_{i}" for i in model.states] + [f"S_{i}_{j}" for i in model.states for j in model.movers]
+    names = [f"M_{i}" for i in model.states] + [f"S_{i}_{j}" for i in model.states for j in model.dynamic_names]
     return names + ([f"D_{i}" for i in model.states] if model.held else upper_triangle_names("N", model.states))
 
 
@@ -44,12 +44,12 @@ def update_layout(model: Model, degree: int) -> dict[str, int]:
 
 def cubature_order(model: Model) -> list[str]:
     """Quantities in the order of the rows of the sigma points' factor L."""
-    return [*model.movers, *(name for name in model.names if name not in model.movers)]
+    return [*model.dynamic_names, *(name for name in model.names if name not in model.dynamic_names)]
 
 
 def cubature_rows(model: Model) -> list[str]:
     """Rows of the sigma points (`estimator.engine.cubature`)."""
-    columns, movers = range(len(model.movers)), model.movers
+    columns, movers = range(len(model.dynamic_names)), model.dynamic_names
     images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
     at_point = [f"X_{i}" for i in movers if i not in model.states]
     factor = [f"L_{c}_{i}" for c in columns for i in cubature_order(model)]

@@ -86,11 +86,11 @@ def differentiate(model: Model) -> ModelDerivatives:
         ValueError: for text that is not an expression, or uses a name that the model does not have.
     """
     symbols = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
-    moves = tuple(parse_expression(text, symbols, model.name) for text in model.moves)
+    moves = tuple(parse_expression(text, symbols, model.name) for text in model.update_expressions)
     without_input = {name: symbols[name] for name in model.names}
     noise = tuple(parse_expression(text, without_input, model.name) for text in model.noise)
     outputs = tuple(parse_expression(text, symbols, model.name) for text in model.outputs.values())
-    jacobian = tuple(tuple(sp.diff(move, symbols[name]) for name in model.movers) for move in moves)
+    jacobian = tuple(tuple(sp.diff(move, symbols[name]) for name in model.dynamic_names) for move in moves)
     output_slopes = tuple(tuple(sp.diff(shown, symbols[name]) for name in model.names) for shown in outputs)
     return ModelDerivatives(moves, jacobian, noise, outputs, output_slopes)
 
@@ -155,13 +155,13 @@ def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagatio
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
     for i, row in zip(model.states, c.jacobian, strict=True):
-        named |= {f"S_{i}_{j}": slope for j, slope in zip(model.movers, row, strict=True)}
+        named |= {f"S_{i}_{j}": slope for j, slope in zip(model.dynamic_names, row, strict=True)}
     lines = substitute(eliminate_common_subexpressions(named, "W"), inputs)
     # What is a number or a bare name needs no line of its own.
     trivial = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
     lines = [(name, e) for name, e in lines if name not in trivial]
     value = lambda name: trivial.get(name, symbol(name))  # noqa: E731
-    is_dynamic = dict.fromkeys(model.names, False) | dict.fromkeys(model.movers, True)
+    is_dynamic = dict.fromkeys(model.names, False) | dict.fromkeys(model.dynamic_names, True)
     jacobian = tuple(
         tuple(value(f"S_{i}_{j}") if is_dynamic[j] else sp.S.Zero for j in model.names) for i in model.states
     )
@@ -181,7 +181,7 @@ def integrator_end(model: Model) -> Propagation:
     """What is carried, as a sample leaves it."""
     states = list(model.states)
     jacobian = tuple(
-        tuple(symbol(f"S_{i}_{j}") if j in model.movers else sp.S.Zero for j in model.names) for i in states
+        tuple(symbol(f"S_{i}_{j}") if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states
     )
     if model.held:
         noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)

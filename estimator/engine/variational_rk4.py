@@ -120,7 +120,7 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     named = {f"K_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
     jacobian = [[slope.xreplace(at) for slope in row] for row in c.jacobian]
     noise = [e.xreplace(at) for e in c.noise]
-    slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.movers) for a, i in enumerate(states)}
+    slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.dynamic_names) for a, i in enumerate(states)}
     if model.held:
         slopes |= {(i, _HELD_NOISE): noise[a] for a, i in enumerate(states)}
     changing = {symbol("u"), *at.values()}
@@ -200,7 +200,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
             )
     return lines, symbolic.Propagation(
         tuple(points["D"].values()),
-        tuple(tuple(jacobian[i, j] if j in model.movers else sp.S.Zero for j in model.names) for i in states),
+        tuple(tuple(jacobian[i, j] if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states),
         tuple(tuple(noise_cov[i, k] for k in states) for i in states),
     )
 

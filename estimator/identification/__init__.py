@@ -78,7 +78,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
         >>> bool(abs(m - 0.4) < 0.004), result.units["m"]
         (True, 'kg')
     """
-    rig = Rig.of(rig)
+    rig = Rig.from_any(rig)
     parsed_records = read_records(records, rig)
     is_free = not any(one.u.any() for one in parsed_records)
     rig = replace(rig, guess=None) if is_free else rig

@@ -160,7 +160,10 @@ class Model:
             raise ValueError(f"pairs of names must differ when joined by '_', but {shared} occur twice; rename one")
         if bool(self.rates) == bool(self.next_state):
             raise ValueError("either rates or next_state must be given; rates for a differential equation")
-        for field_name, values in (("rates" if self.rates else "next_state", self.moves), ("noise", self.noise)):
+        for field_name, values in (
+            ("rates" if self.rates else "next_state", self.update_expressions),
+            ("noise", self.noise),
+        ):
             if len(values) != len(self.states):
                 raise ValueError(
                     f"{field_name} must have one expression per state, {len(self.states)}, but has {len(values)}"
@@ -192,7 +195,9 @@ class Model:
         for sensor, names in zip(self.outputs, output_names, strict=True):
             if names.isdisjoint(self.names):
                 raise ValueError(f"outputs must show a state or a coefficient each, but {sensor!r} shows none")
-        motion_names = [names_in_expression(text, (*self.names, *inputs), self.name) for text in self.moves]
+        motion_names = [
+            names_in_expression(text, (*self.names, *inputs), self.name) for text in self.update_expressions
+        ]
         noise_names = [names_in_expression(text, self.names, self.name) for text in self.noise]
         unused = sorted(set(self.coefficients).difference(*output_names, *motion_names, *noise_names))
         if unused:
@@ -206,7 +211,7 @@ class Model:
         return bool(self.rates)
 
     @property
-    def moves(self) -> tuple[str, ...]:
+    def update_expressions(self) -> tuple[str, ...]:
         """Expressions of the rates or of the next state."""
         return self.rates or self.next_state
 
@@ -233,13 +238,13 @@ class Model:
     @cached_property
     def taps(self) -> int:
         """Number of inputs in a difference equation: 1, or 2 or 3 where it contains ``u1`` or ``u2``."""
-        text = " ".join((*self.moves, *self.outputs.values()))
+        text = " ".join((*self.update_expressions, *self.outputs.values()))
         return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
 
     @cached_property
-    def movers(self) -> tuple[str, ...]:
+    def dynamic_names(self) -> tuple[str, ...]:
         """The states and the coefficients that the motion depends on, without coefficients of sensors alone."""
-        used = set(re.findall(r"[a-z]\w*", " ".join(self.moves)))
+        used = set(re.findall(r"[a-z]\w*", " ".join(self.update_expressions)))
         return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property

@@ -184,7 +184,7 @@ class Rig:
             raise ValueError(f"{place} must be a rig file, but is not: {error}{comma}") from error
 
     @classmethod
-    def of(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
+    def from_any(cls, rig: Rig | Mapping[str, Any] | str | Path) -> Rig:
         """A rig from a rig, a dictionary, the name of a file, or the name of a rig that comes with the package.
 
         For a file with the name of a rig of the package, write ``./beam``.

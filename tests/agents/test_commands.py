@@ -252,7 +252,7 @@ def test_a_rig_that_ships_is_listed_and_copied(run, tmp_path, monkeypatch, name)
     assert name in run("rig", "list")[1].split()
     Path("rig.toml").write_text("step = 1")
     assert run("rig", "init", "rig.toml", "--from", name, "--force")[0] == 0
-    assert Rig.from_file("rig.toml") == Rig.shipped(name) == Rig.of(name)
+    assert Rig.from_file("rig.toml") == Rig.shipped(name) == Rig.from_any(name)
     assert tomllib.loads(Path("rig.toml").read_text())["step"] == Rig.shipped(name).step
 
 

@@ -46,7 +46,7 @@ def test_a_rig_is_the_same_from_a_file_a_dictionary_and_keywords(tmp_path):
     assert rig == Rig(
         1e-3, "linear", 0, Channel("N", limit=20), Channel("m", range=0.03, noise=5e-6), {**GUESS, "c": (0.1, 2)}
     )
-    assert Rig.of(tomllib.loads(TOML)) == rig == Rig.of(json.loads(json.dumps(rig.to_dict())))
+    assert Rig.from_any(tomllib.loads(TOML)) == rig == Rig.from_any(json.loads(json.dumps(rig.to_dict())))
 
 
 @table(
@@ -141,8 +141,8 @@ def test_rigs_that_ship():
 def test_a_file_that_is_named_like_a_rig_that_ships_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "beam").write_text("step = 3")
-    assert Rig.of("beam") == Rig.shipped("beam")
-    assert Rig.of("./beam") == Rig(3)
+    assert Rig.from_any("beam") == Rig.shipped("beam")
+    assert Rig.from_any("./beam") == Rig(3)
 
 
 @table(

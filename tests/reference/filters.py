@@ -48,7 +48,7 @@ class Plant:
 
         def move(z, c, u):
             inputs = {"u": u} if model.is_continuous else dict(zip(("u", "u1", "u2"), u, strict=False))
-            return evaluated(model.moves, z, c, **inputs)
+            return evaluated(model.update_expressions, z, c, **inputs)
 
         return cls(
             move,

@@ -109,7 +109,7 @@ def noise_as_input(model: Model) -> Callable[..., FloatArray]:
     if len(forces) != 1 or not forces[0].free_symbols <= set(coefficients) or forces[0].has(sp.zoo):
         raise ValueError(
             f"model must have its process noise where its input acts, to be planned in blocks, but {model.name!r} has "
-            f"noise {list(model.noise)} for {list(model.moves)}; plan sample by sample"
+            f"noise {list(model.noise)} for {list(model.update_expressions)}; plan sample by sample"
         )
     force: Callable[..., FloatArray] = sp.lambdify(coefficients, forces[0])
     return force

@@ -26,7 +26,7 @@ def generated(case):
 
 
 def movers(case):
-    return [case.model.names.index(i) for i in case.model.movers]
+    return [case.model.names.index(i) for i in case.model.dynamic_names]
 
 
 def assert_equals_reference(case, task, samples):
@@ -94,7 +94,7 @@ def test_on_a_linear_model_it_is_first_order():
         "linear", {"x": "1", "v": "1"}, {"force": "1", "gain": "1", "bias": "1"}, noise=("0", "sqrt(3)"),
         outputs={"y": "x + bias"}, rates=("v", "force + gain*u - x/2 - v/10"), substeps=4,
     )  # fmt: skip
-    assert linear.movers == ("x", "v", "force", "gain")
+    assert linear.dynamic_names == ("x", "v", "force", "gain")
     plant = Plant(
         lambda z, c, u: [z[1], c[0] + c[1] * u - z[0] / 2 - z[1] / 10], lambda z, c, u: [z[0] + c[2]],
         lambda z, c: [0.0, np.sqrt(3.0)], substeps=4,

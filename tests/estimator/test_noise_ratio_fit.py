@@ -1,4 +1,4 @@
-"""The search for the noises and its fits, where hypotheses go wrong."""
+"""The posterior over noise ratios, and batches of linear equations, where hypotheses go wrong."""
 
 from types import SimpleNamespace
 
