@@ -32,7 +32,7 @@ MAX_ERROR_RATIO = {"dynamax": 1.1, "dynamax-jit": 1.1, "scipy": 1.0, "pysindy": 
 #: Peers whose times are compared.
 TIMED_PEERS = ("dynamax", "dynamax-jit")
 
-#: Their time over that of `identify`, at least.
+#: Their time over the time of `identify`, at least.
 MIN_TIME_RATIO = 5.0
 
 #: Statements that a user of `identify` writes, at most.

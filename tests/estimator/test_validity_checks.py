@@ -112,7 +112,7 @@ def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
     records = (u / factor, y) if channel == "input" else (u, y / factor)
     (warning,) = identify(rig_of(BENCH, guess=GUESS), records).warnings
     assert warning.name == "guess"
-    told = re.findall(rf"if the {channel} were about (\S+) times what is recorded", warning.message)
+    told = re.findall(rf"if the {channel} were about (\S+) times as large as recorded", warning.message)
     assert [float(one) for one in told] == pytest.approx([factor], rel=0.1)
 
 

@@ -129,8 +129,8 @@ def _check_overlap(pieces: Sequence[Record]) -> None:
     if overlap := find_shared_samples([(one.u, one.y) for one in pieces]):
         later, earlier = pieces[overlap.later].name, pieces[overlap.earlier].name
         raise ValueError(
-            f"{later} must have samples of its own, but its samples from {overlap.begin_later} on are those of "
-            f"{earlier} from sample {overlap.begin_earlier} on; leave them out of one"
+            f"{later} must have samples of its own, but its samples from {overlap.begin_later} on are samples "
+            f"of {earlier} from sample {overlap.begin_earlier} on; leave them out of one"
         )
 
 

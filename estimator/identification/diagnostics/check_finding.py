@@ -1,4 +1,4 @@
-"""`CheckFinding`: what a check of an identification found."""
+"""`CheckFinding`: a finding of a check, with its message and the parameters that it concerns."""
 
 from __future__ import annotations
 

@@ -60,13 +60,13 @@ _STEP_ERRORS = {
 _CALIBRATION_ERRORS = (
     _ScaleError(
         "guess",
-        "m, c, a and b would agree with the guess if the input were about {:.2g} times what is recorded; check its "
+        "m, c, a and b would agree with the guess if the input were about {:.2g} times as large as recorded; check its "
         "unit and calibration, and the guess",
         {"m": 1, "c": 1, "a": 1, "b": 1},
     ),
     _ScaleError(
         "guess",
-        "m, c, a and b would agree with the guess if the output were about {:.2g} times what is recorded; check its "
+        "m, c, a and b would agree with the guess if the output were about {:.2g} times as large as recorded; check its "
         "unit and calibration, and the guess",
         {"m": -1, "c": -1, "a": -1, "b": -3},
     ),

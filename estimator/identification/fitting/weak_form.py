@@ -41,8 +41,8 @@ _MIN_RESTING_SAMPLES = 8
 #: Inputs and outputs are at rest below this fraction of their size.
 _RESTING_FRACTION = 0.05
 
-#: Smallest random coefficient, in natural sizes: those of a sine of the mean frequency. A motion between two wells is
-#: slower and has harmonics.
+#: Smallest random coefficient, in the natural sizes of a sine of the mean frequency. A motion between two wells
+#: is slower and has harmonics.
 _MIN_RANDOM_SIZE = 0.003
 
 #: Largest random coefficient, in natural sizes.

@@ -132,7 +132,7 @@ class IdentificationProblem:
         return (self.rig.input.lag or 0.0) / self.rig.step
 
     def noises_of_records(self, noises: FloatArray) -> FloatArray:
-        """(n · records, 2) variances of both noises in every record, record by record, from those of all (n, 2)."""
+        """(n · records, 2) noise variances of every record, record by record, from the overall variances (n, 2)."""
         record_scales = np.ones(len(self.u)) if self.record_noise_scales is None else self.record_noise_scales
         return (noises[:, None] * record_scales[:, None] ** 2).reshape(-1, noises.shape[1])
 
