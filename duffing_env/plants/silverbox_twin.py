@@ -1,7 +1,7 @@
 """The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
 
 Run ``python -m duffing_env.plants.silverbox_twin`` with the record at hand to print the constants of
-`estimator.rigs.silverbox_constants.SILVERBOX_TWIN` and of `estimator.support.array_types.SILVERBOX_ODE_TWIN`.
+`estimator.rigs.silverbox_constants.SILVERBOX_TWIN` and of `estimator.rigs.silverbox_constants.SILVERBOX_ODE_TWIN`.
 """
 
 from __future__ import annotations

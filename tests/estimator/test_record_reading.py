@@ -262,7 +262,8 @@ def copies(u, y):
 def test_samples_that_come_twice_are_refused(how):
     given, later, at, earlier, begin = copies(*simulated(SOFT, samples=400))[how]
     message = (
-        f"{later} must have samples of its own, but its samples from {at} on are samples of {earlier} from sample {begin}"
+        f"{later} must have samples of its own, but its samples from {at} on are samples of {earlier} "
+        f"from sample {begin}"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
         read_records(given, Rig(0.01))

@@ -66,8 +66,8 @@ _CALIBRATION_ERRORS = (
     ),
     _ScaleError(
         "guess",
-        "m, c, a and b would agree with the guess if the output were about {:.2g} times as large as recorded; check its "
-        "unit and calibration, and the guess",
+        "m, c, a and b would agree with the guess if the output were about {:.2g} times as large as recorded; check "
+        "its unit and calibration, and the guess",
         {"m": -1, "c": -1, "a": -1, "b": -3},
     ),
 )
