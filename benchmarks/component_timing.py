@@ -40,7 +40,7 @@ def plant_mover() -> Any:
     """``move_all(blocks, inputs)``: move the plants of all blocks by one sample, noise drawn within."""
     draw_noise, plant, u = (
         compile_noise_draw(_PLACE),
-        generated_functions(_EXPERIMENT.kernel_spec).plant,
+        generated_functions(_EXPERIMENT.kernel_spec).step_plant,
         _PLACE["U_0"] * LANES,
     )
 

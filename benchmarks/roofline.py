@@ -19,7 +19,7 @@ from benchmarks.section_tables import Claim, Section
 from benchmarks.timed_rounds import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.kernel import RESET_NEXT_STEP, compile_belief_update
+from duffing_env.kernel import RESET_NEXT_STEP, compile_update_stage
 from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout
@@ -129,15 +129,15 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     kind = experiment.kernel_spec
     code = generated_functions(kind)
     if factorisation == "structured":
-        inference = {compile_belief_update(kind): 1}
+        inference = {compile_update_stage(kind): 1}
     else:
         begin, iterate, end, _ = mean_field.compile_mean_field(block_layout(kind))
         inference = {begin: 1, iterate: experiment.kernel_params.iterations, end: 1}
     return {
         "noise": {compile_noise_draw(block_layout(kind)): 1},
-        "plant": {code.plant: 1},
+        "plant": {code.step_plant: 1},
         _INFERENCE[factorisation]: inference,
-        "reward and end": {code.settle: 1},
+        "reward and end": {code.finish_step: 1},
         "observation": {code.observe_lanes: 1},
     }
 

@@ -144,9 +144,9 @@ def _compile_reward_loop(function: Any, parameters: tuple[str, ...]) -> Any:
     row = {who: ", ".join(f"{who}[{k}][i]" for k in fields) for who in ("before", "after")}
     truth = ", ".join(f"truth[i, {k}]" for k in range(len(parameters)))
     loop_source = "def loop(before, after, u, y, truth, paid):\n    for i in range(len(paid)):\n"
-    loop_source += f"        one, other = Row({row['before']}), Row({row['after']})\n"
+    loop_source += f"        one, other = BeliefRow({row['before']}), BeliefRow({row['after']})\n"
     loop_source += f"        paid[i] = function(one, other, u[i], y[i], {f'Truth({truth})' if parameters else None})\n"
-    namespace: dict[str, Any] = {"Row": BeliefRow, "Truth": namedtuple("Truth", parameters), "function": function}
+    namespace: dict[str, Any] = {"BeliefRow": BeliefRow, "Truth": namedtuple("Truth", parameters), "function": function}
     exec(loop_source, namespace)
     return numba.njit(namespace["loop"])
 

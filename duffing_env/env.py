@@ -89,7 +89,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
 
-    The ranges are those of an episode's sum. `duffing_env.step_rewards.reward_registry` (the manual's page "Rewards") says what each bounds,
+    The ranges are those of an episode's sum. `duffing_env.rewards.reward_registry` (the manual's page "Rewards") says what each bounds,
     and how it can be fooled. What is gained is kept when an episode is terminated, unless ``terminated_return`` is set;
     with ``terminal`` it is paid in the last step, in one sum.
 

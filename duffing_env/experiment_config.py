@@ -142,7 +142,7 @@ class Experiment:
 
     @property
     def plant_params(self) -> dict[str, Any]:
-        """Fields of `Setup` that describe the plant."""
+        """Fields of `KernelParams` that describe the plant."""
         return {}
 
     @property

@@ -107,12 +107,12 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
         REWARDS[spec.reward_hooks].reward_hooks.compile_hooks(spec, generated) if has_reward_hooks else no_hooks
     )
     set_true_coefficients, evaluate_belief, finish_step, observe = (
-        generated.settle_truth,
-        generated.appraise,
-        generated.settle,
+        generated.set_true_coefficients,
+        generated.evaluate_belief,
+        generated.finish_step,
         generated.observe,
     )
-    add_random_walk: Any = generated.walk
+    add_random_walk: Any = generated.add_random_walk
     unpack = compile_unpacker(spec)
     compile_inner, compile_entry = jit_closure(spec.name), kernel(variant=spec.name)
 
@@ -292,11 +292,11 @@ def _compile_plant_step(spec: KernelSpec, generated: Any, draw_noise: Any) -> An
     model, n_outputs = spec.plant_model, spec.plant_model.n_outputs
     if n_outputs > 3:
         raise ValueError(f"outputs must be at most 3 in an environment, but {model.name!r} has {n_outputs}")
-    plant, steps, draws_each_step = generated.plant, model.substeps, not model.held
+    plant, steps, draws_each_step = generated.step_plant, model.substeps, not model.held
     substep_length, sqrt_length, sqrt_3 = 1.0 / steps, math.sqrt(1.0 / steps), math.sqrt(3.0)
-    sense_0: Any = getattr(generated, "sense_0", None)
-    sense_1 = getattr(generated, "sense_1", sense_0)
-    sense_2 = getattr(generated, "sense_2", sense_0)
+    measure_0: Any = getattr(generated, "measure_0", None)
+    measure_1 = getattr(generated, "measure_1", measure_0)
+    measure_2 = getattr(generated, "measure_2", measure_0)
     is_continuous = model.is_continuous
 
     @jit_closure(spec.name)
@@ -306,14 +306,14 @@ def _compile_plant_step(spec: KernelSpec, generated: Any, draw_noise: Any) -> An
                 plant(W, s / steps, substep_length, sqrt_length, sqrt_3)
                 if draws_each_step:
                     draw_noise(W)
-            sense_0(W)
+            measure_0(W)
         else:
             plant(W)
         if n_outputs > 1:
             draw_noise(W)
-            sense_1(W)
+            measure_1(W)
         if n_outputs > 2:
             draw_noise(W)
-            sense_2(W)
+            measure_2(W)
 
     return step_plant

@@ -32,7 +32,7 @@ def capped_error(ratio):
     return deviation if deviation < 1.0 else 1.0
 
 
-_COMPILED_NAMES = {**RUNTIME_FUNCTIONS, "capped": capped_error}
+_COMPILED_NAMES = {**RUNTIME_FUNCTIONS, "capped_error": capped_error}
 
 #: Bounds of a determinant that has a logarithm: below, numbers lose digits.
 _MIN_DETERMINANT, _MAX_DETERMINANT = 2.0**-1000, 2.0**1000
@@ -70,21 +70,21 @@ def _environment_source(spec: KernelSpec) -> str:
 
 
 def _random_walk_source(model: Model, loop: Any) -> str:
-    """``walk(W, variances)``: let the coefficients walk at random before a sample."""
+    """``add_random_walk(W, variances)``: let the coefficients walk at random before a sample."""
     from estimator.engine.symbolic import symbol
 
     names = list(model.coefficients)
     lines = [(f"V_{c}", symbol(f"P_{c}_{c}") + symbol(f"WALK_{c}")) for c in names]
     results = {f"P_{c}_{c}": f"V_{c}" for c in names}
-    source = loop("walk_lanes", "The coefficients walk.", lines, results, *(f"WALK_{c}" for c in names))
+    source = loop("add_random_walk_lanes", "The coefficients walk.", lines, results, *(f"WALK_{c}" for c in names))
     arguments = ", ".join(f"variances[{i}]" for i in range(len(names)))
-    return source + f"@scalar_jit\ndef walk(W, variances):\n    walk_lanes(W, {arguments})\n"
+    return source + f"@scalar_jit\ndef add_random_walk(W, variances):\n    add_random_walk_lanes(W, {arguments})\n"
 
 
 def _plant_source(model: Model, degree: int, loop: Any) -> str:
-    """``plant_model``: the plant over a sample with its noise, or over a Runge-Kutta step of it; and its sensors.
+    """``step_plant``: the plant over a sample with its noise, or over a Runge-Kutta step of it; and its sensors.
 
-    A difference equation shows its first sensor as well; other sensors are ``sense_<k>``.
+    A difference equation shows its first sensor as well; other sensors are ``measure_<k>``.
     """
     from estimator.engine import symbolic
 
@@ -116,16 +116,16 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
         state_rows = names if model.is_continuous or k else {**names, **after}
         value = symbolic.substitute([("", output_expression)], {**state_rows, "u": end})[0][1] + noise
         if model.is_continuous or k:
-            source += loop(f"sense_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
+            source += loop(f"measure_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
         else:
             lines.append(("SHOWN", value))
             results |= {f"Y_{y}": "SHOWN"}
     substep_arguments = ("T", "length", "root", "root_3") if model.is_continuous else ()
-    return source + loop("plant", "The plant moves.", lines, results, *substep_arguments)
+    return source + loop("step_plant", "The plant moves.", lines, results, *substep_arguments)
 
 
 def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
-    """``settle_truth(W, j, step)``: the coefficients of lane j's plant, in the equations of plant and belief.
+    """``set_true_coefficients(W, j, step)``: the coefficients of lane j's plant, in the equations of plant and belief.
 
     And what estimates are multiplied by to be compared with its parameters: every sample would divide otherwise.
     """
@@ -147,7 +147,7 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
     for p in estimated_expressions(spec.belief_model):
         lines.append((f"V_PER_{p}", 1 / symbolic.symbol(f"PARAM_{p}")))
         results[f"PER_{p}"] = f"V_PER_{p}"
-    return loop("settle_truth", "The true coefficients, of the parameters.", lines, results, "step", one=True)
+    return loop("set_true_coefficients", "The true coefficients, of the parameters.", lines, results, "step", one=True)
 
 
 def log_det_and_density(
@@ -206,7 +206,7 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     lines.append(("NEW_LOG_DET", sp.Function("log")(determinant)))
     lines.append(("NEW_LOG_DENSITY", -(symbol("NEW_LOG_DET") + square) / 2))
     coefficient_symbols = {c: symbol(c) for c in model.coefficients} | {"step": symbol("step")}
-    capped_error_symbol = sp.Function("capped")
+    capped_error_symbol = sp.Function("capped_error")
     ratios = {
         f"RATIO_{p}": symbolic.parse_expression(text, coefficient_symbols, model.name) * symbol(f"PER_{p}")
         for p, text in estimated_expressions(model).items()
@@ -217,7 +217,7 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
 
 
 def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
-    """``appraise(W, j, step)`` for a new belief or truth, and ``settle(W, ...)``, what a step gave and what it ends."""
+    """``evaluate_belief(W, j, step)`` for a new belief or truth, and ``finish_step(W, ...)``, what a step gave and what it ends."""
     import sympy as sp
 
     from estimator.engine.symbolic import symbol
@@ -225,7 +225,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     model = spec.belief_model
     lines, is_sound = _belief_beside_truth(spec)
     result_rows = {name: f"NEW_{name}" for name in ("LOG_DET", "LOG_DENSITY", "ERROR")}
-    source = loop("appraise", "Measure lane j's belief beside its truth.", lines, result_rows, "step", one=True)
+    source = loop("evaluate_belief", "Measure lane j's belief beside its truth.", lines, result_rows, "step", one=True)
     select, is_positive, is_finite = (sp.Function(name) for name in ("select", "positive", "finite"))
     variances = {f"P_{name}_{name}" for name in model.names}
     checked_rows = [name for name in belief_rows(model) if not name.startswith("P_") or name in variances]
@@ -244,11 +244,11 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     lines.append(("E_WORK", select(symbol("VOID"), sp.S.Zero, symbol("WORK"))))
     lines.append(("GAIN", (symbol("LOG_DET") - symbol("E_LOG_DET")) / 2))
     lines.append(("POSTERIOR", symbol("E_LOG_DENSITY") - symbol("LOG_DENSITY")))
-    weight_names = ("w_gain", "w_posterior", "w_error", "w_work")
+    weight_names = ("information_weight", "posterior_weight", "error_weight", "hook_weight")
     reward_terms = (symbol("GAIN"), symbol("POSTERIOR"), symbol("ERROR") - symbol("E_ERROR"), symbol("E_WORK"))
     reward = sum(symbol(weight) * value for weight, value in zip(weight_names, reward_terms, strict=True))
     # In two lines, because SymPy squares the factors, and the input's square alone may overflow.
-    lines.append(("EFFORT", symbol("input_price") * symbol("INPUT")))
+    lines.append(("EFFORT", symbol("sqrt_input_cost") * symbol("INPUT")))
     reward -= symbol("EFFORT") ** 2
     first_sensor = next(iter(model.outputs))
     is_beyond_limit = is_positive(symbol("VOID")) + is_positive(
@@ -260,9 +260,9 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     results = {"LOG_DET": "E_LOG_DET", "LOG_DENSITY": "E_LOG_DENSITY", "ERROR": "E_ERROR", "REWARD": "PAID"}
     results |= {"INFORMATION_GAIN": "GAIN", "LOG_POSTERIOR_GAIN": "POSTERIOR", "TERMINATED": "STOPPED"}
     results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED": "LATER"}
-    uniform = ("step", "max_output", "horizon", "input_price", *weight_names)
+    uniform = ("step", "max_output", "horizon", "sqrt_input_cost", *weight_names)
     doc = "What a sample gave, and whether it ends the episode; a belief that is broken gives nothing and ends it."
-    return source + loop("settle", doc, lines, results, *uniform)
+    return source + loop("finish_step", doc, lines, results, *uniform)
 
 
 def _observation_source(spec: KernelSpec) -> str:

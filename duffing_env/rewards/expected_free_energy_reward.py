@@ -27,7 +27,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
     noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
     noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in spec.belief_model.outputs}
-    return expected_sample_source("expect", spec, loop, noises)
+    return expected_sample_source("expect_sample", spec, loop, noises)
 
 
 def expected_sample_source(
@@ -95,7 +95,7 @@ def expected_sample_source(
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """It expects before the belief is updated."""
-    expect_sample = generated.expect
+    expect_sample = generated.expect_sample
 
     @jit_closure(spec.name)
     def before_update(W, params):

@@ -25,12 +25,12 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     truth_rows |= {name: f"I_{name}" for name in belief_rows(model) if name.startswith("P_")}
     names, stds = ["Q", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
     noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
-    return expected_sample_source("ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
+    return expected_sample_source("update_ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """It starts from the prior, and counts a sample before the plant moves."""
-    row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.ideal
+    row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.update_ideal
     names = belief_rows(model)
     information_rows = tuple(
         (names.index(name), row_of[f"I_{name}"] * LANES) for name in names if name.startswith("P_")

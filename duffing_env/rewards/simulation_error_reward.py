@@ -54,10 +54,10 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
     substep_arguments = ("T",) if model.is_continuous else ()
     source_text = loop(
-        "model_move", "The believed plant moves.", *propagate_state(model, spec.degree, believed), *substep_arguments
+        "step_believed", "The believed plant moves.", *propagate_state(model, spec.degree, believed), *substep_arguments
     )
     source_text += loop(
-        "twin_move", "The true plant moves.", *propagate_state(model, spec.degree, true), *substep_arguments
+        "step_true", "The true plant moves.", *propagate_state(model, spec.degree, true), *substep_arguments
     )
     output_expression = differentiate(model).outputs[0].subs(symbol("u"), 0)
     believed_output, true_output = (substitute([("", output_expression)], names)[0][1] for names in (believed, true))
@@ -65,12 +65,12 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
         ("E_d", symbol("DEVIATION") + (believed_output - true_output) ** 2),
         ("E_p", symbol("POWER") + true_output**2),
     ]
-    source_text += loop("compare", "Add up what differs.", lines, {"DEVIATION": "E_d", "POWER": "E_p"})
+    source_text += loop("add_difference", "Add up what differs.", lines, {"DEVIATION": "E_d", "POWER": "E_p"})
     misfit = sp.sqrt(symbol("DEVIATION") / symbol("POWER"))
     # ``reaches`` is 0 for NaN, which so counts as 1.
     bounded_misfit = sp.Function("select")(sp.Function("reaches")(sp.S.One, symbol("RATIO")), symbol("RATIO"), sp.S.One)
     lines = [("RATIO", misfit), ("KEPT", bounded_misfit), ("FALL", symbol("MISFIT") - symbol("KEPT"))]
-    return source_text + loop("conclude", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"})
+    return source_text + loop("finish_misfit", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"})
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
@@ -81,10 +81,10 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     inputs, feed_input = tuple(row * LANES for row in rows), compile_input_writer(model, spec.degree, rows, LANES)
     reward_row, misfit_row = row_of["WORK"] * LANES, row_of["MISFIT"] * LANES
     step_believed, step_true, add_difference, finish_misfit = (
-        generated.model_move,
-        generated.twin_move,
-        generated.compare,
-        generated.conclude,
+        generated.step_believed,
+        generated.step_true,
+        generated.add_difference,
+        generated.finish_misfit,
     )
     substeps, is_continuous = model.substeps, model.is_continuous
 

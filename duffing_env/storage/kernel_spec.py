@@ -164,8 +164,8 @@ def compile_unpacker(spec: KernelSpec) -> Any:
 
 @cache  # most kinds have the same sizes
 def _compiled_unpacker(arguments: str) -> Any:
-    namespace: dict[str, Any] = {"Setup": KernelParams}
-    exec(f"def unpack(packed):\n    return Setup({arguments})\n", namespace)
+    namespace: dict[str, Any] = {"KernelParams": KernelParams}
+    exec(f"def unpack(packed):\n    return KernelParams({arguments})\n", namespace)
     return jit_closure(hashlib.sha256(arguments.encode()).hexdigest()[:12])(namespace["unpack"])
 
 

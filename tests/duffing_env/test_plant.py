@@ -23,7 +23,7 @@ def move_plant(flat, process_noise, measurement_noise):
     """A sample of the plant, with the noise that stands in the block."""
     for name, std in (("PROCESS_STD", process_noise), ("SENSOR_STD_y", measurement_noise)):
         flat[PLACE[name] * LANES : (PLACE[name] + 1) * LANES] = std
-    generated_functions(KIND).plant(flat)
+    generated_functions(KIND).step_plant(flat)
 
 
 def block(**rows):

@@ -61,7 +61,7 @@ class Lanes:
         for name in self.model.physical:
             self[f"PARAM_{name}"][:] = getattr(truth, name)
         for lane in range(LANES):
-            self.code.settle_truth(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
+            self.code.set_true_coefficients(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
 
     def set_coefficients(self, mean, cov):
         names = [COEFFICIENTS[k] for k in self.active]
@@ -72,12 +72,12 @@ class Lanes:
 
     def appraise(self):
         for lane in range(LANES):
-            self.code.appraise(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
+            self.code.evaluate_belief(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
 
     def settle(self, input_cost=0.0, terminal=False, terminated_return=None):
         weights = REWARDS[self.reward].weights
         price = np.sqrt(input_cost)
-        self.code.settle(self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
+        self.code.finish_step(self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
         forfeits = terminated_return is not None
         if terminal or forfeits:
             payer(self.kernel_spec)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)
