@@ -160,6 +160,9 @@ def compile_kernel(spec: KernelSpec) -> Kernel:
                 if s > 0:
                     for i in range(n_rows * LANES):
                         workspace[n_saved + i] = W[i]
+                    for j in range(LANES):  # what has ended waits: its noise and its filter bank stay as they are
+                        if W[terminated + j] + W[truncated + j] != 0.0:
+                            W[needs_reset + j] = 1.0
                 for j in range(LANES):
                     W[requested_input + j] = params.max_input * max(-1.0, min(1.0, actions[lane + j]))
                 limit_input(W, params.budget, params.max_slew)

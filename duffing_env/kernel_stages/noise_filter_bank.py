@@ -37,8 +37,9 @@ class FilterBank(NamedTuple):
 
     Attributes:
         reset: ``reset(members, env_index, params)`` puts those of an environment to their priors.
-        update: ``update(W, members, block, params)`` updates those of a block's environments with its inputs and outputs,
-            and the environments' beliefs to their mixtures.
+        update: ``update(W, members, block, params)`` updates those of a block's environments with its inputs and
+            outputs, and the environments' beliefs to their mixtures. Members of an environment that waits for its
+            reset stay as they are.
 
     Lanes of a block behind ``params.interleaved_envs`` have none, and keep their beliefs.
     """
@@ -68,7 +69,7 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         (max(member_rows.values()) + 1) * LANES,
         row_of.get("FREE_ENERGY", -1) * LANES,
     )
-    unsound_row = member_rows.get("UNSOUND", -1) * LANES
+    unsound_row, needs_reset = member_rows.get("UNSOUND", -1) * LANES, row_of["WAITING"] * LANES
     free_energies_of = compile_free_energies(model, spec.iterations, LANES, member_rows, every_iteration=False)
     compile_inner = jit_closure(spec.name)
 
@@ -85,7 +86,7 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
                 U[(record_size - 4 + i) * LANES + lane] = params.hypothesis_priors[m, i]
 
     @compile_inner
-    def update_block(U, V, W, n, params, energies_found):
+    def update_block(U, V, W, n, has_waiting, params, energies_found):
         """Update the members in a block U, by way of a whole block V; ``energies_found`` receives their free energies."""
         copy_range(V, 0, U, 0, weight_row)
         for to, source in copied_rows:
@@ -100,6 +101,11 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         free_energies_of(V, energies_found)
         for j in range(LANES if unsound_row >= 0 else 0):
             energies_found[j] = np.nan if V[unsound_row + j] > 0.0 else energies_found[j]
+        for lane in range(0, LANES if has_waiting else 0, n):
+            for j in range(n):
+                if W[needs_reset + j] != 0.0:
+                    for i in range(record_size):
+                        V[i * LANES + lane + j] = U[i * LANES + lane + j]
         copy_range(U, 0, V, 0, weight_row)
 
     @compile_inner
@@ -108,15 +114,22 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         stop = -(-count * n // LANES)
         first, V, energies_found = block * stop, np.zeros(scratch_size), np.empty(stop * LANES)
         weights, normalised_weights, energies = np.empty(count * n), np.empty(count * n), np.empty(n)
+        n_waiting = 0
+        for j in range(n):
+            n_waiting += W[needs_reset + j] != 0.0
         for b in range(stop):
-            update_block(members[first + b], V, W, n, params, energies_found[b * LANES : (b + 1) * LANES])
+            found = energies_found[b * LANES : (b + 1) * LANES]
+            update_block(members[first + b], V, W, n, n_waiting > 0, params, found)
         for m in range(0, count * n, n):
             copy_range(weights, m, members[first + m // LANES], weight_row + m % LANES, n)
         member_weights, member_energies = weights.reshape((count, n)), energies_found[: count * n].reshape((count, n))
         apply_switching(member_weights, member_energies)
         reweight(member_weights, member_energies, energies)
         for m in range(0, count * n, n):
-            copy_range(members[first + m // LANES], weight_row + m % LANES, weights, m, n)
+            U, lane = members[first + m // LANES], m % LANES
+            for j in range(n):
+                if W[needs_reset + j] == 0.0:
+                    U[weight_row + lane + j] = weights[m + j]
         mix(members, first, member_weights, normalised_weights, W, LANES)
         if free_energy_row >= 0:
             copy_range(W, free_energy_row, energies, 0, n)

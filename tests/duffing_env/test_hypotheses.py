@@ -136,6 +136,23 @@ def test_a_member_that_overflowed_has_no_say():
     np.testing.assert_array_equal(np.delete(envs.records, 4, 0), np.delete(plain.records, 4, 0))
 
 
+@pytest.mark.parametrize("size", [1, 3])
+def test_members_stay_as_an_episode_left_them_that_ended_within_a_hold(size):
+    options = OPTIONS | {"horizon": 6, "max_input": 0.01}
+    held = DuffingVectorEnv(size, hold=4, autoreset_mode="Disabled", **options)
+    held.reset(seed=[3] * size)
+    for _ in range(2):
+        *_, truncated, _ = held.step(np.full((size, 1), 0.5, dtype=np.float32))
+    assert truncated.all()
+    sampled = DuffingEnv(**options)
+    sampled.reset(seed=3)
+    for _ in range(6):
+        sampled.step([0.5])
+    for index in range(size):
+        for of_held, of_sampled in zip(held.mixture(index), sampled.mixture(), strict=True):
+            np.testing.assert_array_equal(of_held, of_sampled)
+
+
 def test_what_cannot_weigh_hypotheses_says_so():
     numbers = [0, -1, 2.0, True, None, "3", 100]
     message = "noise_hypotheses must be a whole number from 1 to 99, but is"
