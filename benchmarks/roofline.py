@@ -19,9 +19,10 @@ from benchmarks.section_tables import Claim, Section
 from benchmarks.timed_rounds import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.kernel import RESET_NEXT_STEP, compile_update_stage
+from duffing_env.kernel import RESET_NEXT_STEP
 from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
+from duffing_env.kernel_stages.sample_stages import compile_update
 from duffing_env.storage.kernel_spec import block_layout
 from estimator.compilation.scalar_jit import scalar_jit
 from estimator.compilation.simd import LANES, jit, lanewise, number_rows
@@ -129,7 +130,7 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
     kind = experiment.kernel_spec
     code = generated_functions(kind)
     if factorisation == "structured":
-        inference = {compile_update_stage(kind): 1}
+        inference = {compile_update(kind): 1}
     else:
         begin, iterate, end, _ = mean_field.compile_mean_field(block_layout(kind))
         inference = {begin: 1, iterate: experiment.kernel_params.iterations, end: 1}

@@ -7,89 +7,19 @@ environment call them once a step, however many samples that holds.
 from __future__ import annotations
 
 from collections import namedtuple
-from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from duffing_env.batch import Batch
+from duffing_env.belief_arrays import OBSERVATION_BOUND, Beliefs
+from duffing_env.experiment_config import Experiment
 from duffing_env.storage.kernel_spec import observation_bounds
-from estimator.belief import covariance_indices
-from estimator.models.model import Model
-from estimator.rigs.physical_parameters import propagate_to_physical
-from estimator.rigs.units import VOLT_SCALES, Scales
-from estimator.support.argument_checks import check_integer, short_repr
 from estimator.support.array_types import FloatArray
 
-if TYPE_CHECKING:
-    from duffing_env.batch import Batch
-    from duffing_env.experiment_config import Experiment
-
 Flags: TypeAlias = npt.NDArray[np.bool_]
-
-#: Observations by name; see `duffing_env.env.DuffingEnv`.
-OBSERVATIONS = ("posterior", "history", "privileged")
-
-#: Steps that the observation ``history`` shows, at most.
-MAX_HISTORY = 10_000
-
-#: Entries of an observation that is a function of the belief are clipped to this.
-OBSERVATION_BOUND = 10.0
-
-
-@dataclass(frozen=True)
-class Beliefs:
-    """What n environments believe: `estimator.Belief`, as arrays.
-
-    Attributes:
-        model: whose states and coefficients these are.
-        records: (n, size) their records.
-        scales: what one inside is worth outside, for physical parameters.
-    """
-
-    model: Model
-    records: FloatArray
-    scales: Scales = VOLT_SCALES
-
-    @property
-    def mean(self) -> FloatArray:
-        """(n, d) means of states and coefficients."""
-        return self.records[:, : len(self.model.names)]
-
-    @property
-    def cov(self) -> FloatArray:
-        """(n, d, d) their covariances."""
-        return self.records[:, covariance_indices(self.model)]
-
-    @property
-    def coefficients_mean(self) -> FloatArray:
-        """(n, K) means of the coefficients."""
-        return self.mean[:, self.model.n_states :]
-
-    @property
-    def coefficients_cov(self) -> FloatArray:
-        """(n, K, K) covariances of the coefficients."""
-        n = self.model.n_states
-        return self.records[:, covariance_indices(self.model)[n:, n:]]
-
-    @property
-    def noises(self) -> FloatArray:
-        """(n, 2 + 2 sensors) shape and rate of γ, then of each ξ."""
-        return self.records[:, -2 - 2 * self.model.n_outputs :]
-
-    def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Means (n, p) and covariances (n, p, p) of the physical parameters, as `estimator.Belief.physical`."""
-        return propagate_to_physical(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
-
-
-def check_observation(observation: Any, history: int) -> None:
-    """Refuse what is no observation, or no number of steps."""
-    if not callable(observation) and not (isinstance(observation, str) and observation in OBSERVATIONS):
-        raise ValueError(
-            f"observation must be one of {list(OBSERVATIONS)} or a function, but is {short_repr(observation)}"
-        )
-    check_integer("history", history, MAX_HISTORY)
 
 
 def experiment_observation_bounds(experiment: Experiment) -> FloatArray:

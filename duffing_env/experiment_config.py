@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from duffing_env.custom_functions import Beliefs, check_observation
+from duffing_env.belief_arrays import Beliefs, check_observation
 from duffing_env.rewards.reward_registry import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
@@ -160,7 +160,7 @@ class Experiment:
         return KernelSpec(
             self.model, self.plant, self.degree, self.factorisation,
             self._n_iterations if self.factorisation == "structured" else 0,
-            str(self.reward) if kernel_reward(self.reward).hooks_module else "",
+            str(self.reward) if kernel_reward(self.reward).compile_hooks else "",
             self.noise_hypotheses != 1, self.uses_cubature and self.noise_hypotheses != 1,
         )  # fmt: skip
 

@@ -29,8 +29,6 @@ from duffing_env.env_base import (
 from duffing_env.experiment_config import MAX_SAMPLES, Experiment
 from duffing_env.kernel import RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP
 from duffing_env.storage.kernel_spec import OUTCOME_ROWS
-from duffing_env.tracks.continuous_tracks import ContinuousEnv
-from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
 from estimator.belief import Belief
 from estimator.models.named_parameters import Parameters
 from estimator.support.argument_checks import MAX_SEED, check_integer, short_repr, to_float_array
@@ -331,20 +329,3 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         # One by one: NumPy would take what has a length for a row of its own.
         truths[rows] = np.fromiter(self._batch.truths(rows, final=same_step), dtype=object, count=len(rows))
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}
-
-
-class ContinuousVectorEnv(DuffingVectorEnv):
-    """Many `ContinuousEnv` at once."""
-
-    single_env_class: ClassVar[type[DuffingEnv]] = ContinuousEnv
-
-
-class SilverboxReplayVectorEnv(DuffingVectorEnv):
-    """Many `SilverboxReplayEnv` at once; all rows replay the same record."""
-
-    single_env_class: ClassVar[type[DuffingEnv]] = SilverboxReplayEnv
-
-    @property
-    def recorded_input(self) -> FloatArray:
-        """The inputs that the record can answer, in order [V]."""
-        return self.experiment.replayed_record[0]

@@ -15,11 +15,11 @@ import pytest
 from reference.plants import DRAG
 
 from duffing_env.env import DuffingEnv
-from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.continuous_tracks import ContinuousEnv, ContinuousVectorEnv
 from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
 from duffing_env.tracks.rig_env import RigEnv, RigVectorEnv
-from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
-from duffing_env.vector_env import ContinuousVectorEnv, DuffingVectorEnv, SilverboxReplayVectorEnv
+from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv, SilverboxReplayVectorEnv
+from duffing_env.vector_env import DuffingVectorEnv
 from estimator import Channel, Rig
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing

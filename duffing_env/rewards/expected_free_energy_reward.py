@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
+from duffing_env.rewards.log_determinant import log_det_and_density
+from duffing_env.rewards.reward_hooks import RewardHooks, no_hook, no_lane_hook
 from duffing_env.storage.kernel_spec import KernelSpec
 from estimator.compilation.simd import jit_closure
 from estimator.engine.storage_layout import integrator_rows
@@ -50,7 +51,6 @@ def expected_sample_source(
     """
     import sympy as sp
 
-    from duffing_env.kernel_stages.env_codegen import log_det_and_density
     from estimator.engine import gaussian_update, symbolic, variational_rk4
 
     model, source, body = spec.belief_model, "", ""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from duffing_env.rewards.expected_free_energy_reward import expected_sample_source
-from duffing_env.rewards.reward_registry import RewardHooks, no_hook
+from duffing_env.rewards.reward_hooks import RewardHooks, no_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout, noise_std_rows
 from estimator.compilation.simd import LANES, jit_closure
 from estimator.engine.storage_layout import belief_rows

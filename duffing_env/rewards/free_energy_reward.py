@@ -6,17 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.rewards.reward_registry import RewardHooks, no_hook, no_lane_hook
+from duffing_env.rewards.reward_hooks import RewardHooks, no_hook, no_lane_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import LANES, jit_closure
 from estimator.engine.variational_free_energy import compile_free_energies
 from estimator.inference import mean_field
-
-
-def hook_source(spec: KernelSpec, loop: Any) -> str:
-    """Nothing of its own: the update leaves what it needs."""
-    return ""
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:

@@ -56,59 +56,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
-from estimator.compilation.simd import jit
+from duffing_env.rewards import (
+    expected_free_energy_reward,
+    fisher_reward,
+    free_energy_reward,
+    simulation_error_reward,
+)
+from duffing_env.rewards.reward_hooks import NO_HOOKS, RewardHooks
+from duffing_env.storage.kernel_spec import KernelSpec
 from estimator.support.argument_checks import did_you_mean
-
-
-class RewardHooks(NamedTuple):
-    """Work of a reward's own, compiled into the kernel; it leaves its result in row ``WORK``.
-
-    Attributes:
-        on_episode_start: ``on_episode_start(W, j, params)`` where an episode begins in lane j, or its truth changes.
-        before_plant_step: ``before_plant_step(W, params)`` before the plant moves.
-        before_update: ``before_update(W, params)`` before the belief is updated.
-        after_update: ``after_update(W, params)`` after it.
-    """
-
-    on_episode_start: Any
-    before_plant_step: Any
-    before_update: Any
-    after_update: Any
-
-
-@jit
-def no_hook(W, params):
-    """A hook that has nothing to do."""
-
-
-@jit
-def no_lane_hook(W, j, params):
-    """The same, of one lane."""
 
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward.
+    """A reward that the kernel computes: a weighted sum of four terms, one of which is a reward's own work.
 
     Attributes:
         weights: of what a sample gave: the decrease of entropy, the increase of the log posterior at the truth [nats],
-            the decrease of the parameters' error, and the ``WORK`` of its hooks.
+            the decrease of the parameters' error, and row ``WORK``, which the hooks leave.
         needs_truth: whether it compares with the true plant.
-        hooks_module: that makes its hooks, if it has any: ``hooks(kind, code)``, of the compiled functions of a kind; among
-            these are what ``source(kind, loop)`` generates with the loop of `duffing_env.kernel_stages.env_codegen`.
+        compile_hooks: ``compile_hooks(spec, generated)`` makes the hooks, of the functions that are generated for an
+            environment (`duffing_env.kernel_stages.env_codegen`); None for a reward without hooks.
+        hook_source: ``hook_source(spec, loop)`` is the source of what the hooks need among these functions, by the loop
+            printer of `duffing_env.kernel_stages.env_codegen`; None where they need nothing.
     """
 
     weights: tuple[float, float, float, float]
     needs_truth: bool = False
-    hooks_module: str = ""
-
-    @property
-    def reward_hooks(self) -> Any:
-        """The module, which is imported only where the reward is used."""
-        return import_module(self.hooks_module)
+    compile_hooks: Callable[[KernelSpec, Any], RewardHooks] | None = None
+    hook_source: Callable[[KernelSpec, Any], str] | None = None
 
 
 _HOOK_WEIGHTS = (0.0, 0.0, 0.0, 1.0)
@@ -119,11 +97,21 @@ REWARDS = {
     "information_gain": Reward((1.0, 0.0, 0.0, 0.0)),
     "log_posterior": Reward((0.0, 1.0, 0.0, 0.0), needs_truth=True),
     "parameter_error": Reward((0.0, 0.0, 1.0, 0.0), needs_truth=True),
-    "free_energy": Reward(_HOOK_WEIGHTS, False, "duffing_env.rewards.free_energy_reward"),
-    "fisher": Reward(_HOOK_WEIGHTS, True, "duffing_env.rewards.fisher_reward"),
-    "expected_free_energy": Reward(_HOOK_WEIGHTS, False, "duffing_env.rewards.expected_free_energy_reward"),
-    "simulation_error": Reward(_HOOK_WEIGHTS, True, "duffing_env.rewards.simulation_error_reward"),
+    "free_energy": Reward(_HOOK_WEIGHTS, False, free_energy_reward.compile_hooks),
+    "fisher": Reward(_HOOK_WEIGHTS, True, fisher_reward.compile_hooks, fisher_reward.hook_source),
+    "expected_free_energy": Reward(
+        _HOOK_WEIGHTS, False, expected_free_energy_reward.compile_hooks, expected_free_energy_reward.hook_source
+    ),
+    "simulation_error": Reward(
+        _HOOK_WEIGHTS, True, simulation_error_reward.compile_hooks, simulation_error_reward.hook_source
+    ),
 }
+
+
+def compile_reward_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
+    """The hooks of a kind of experiment, of the functions that are generated for it."""
+    compile_hooks = REWARDS[spec.reward_hooks].compile_hooks if spec.reward_hooks else None
+    return compile_hooks(spec, generated) if compile_hooks else NO_HOOKS
 
 
 def kernel_reward(reward: str | Callable[..., Any]) -> Reward:

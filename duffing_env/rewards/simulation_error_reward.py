@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.rewards.reward_registry import RewardHooks, no_hook
+from duffing_env.rewards.reward_hooks import RewardHooks, no_hook
 from duffing_env.storage.kernel_spec import KernelSpec, block_layout
 from estimator.compilation.array_operations import copy_range
 from estimator.compilation.simd import LANES, jit_closure
@@ -70,7 +70,9 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     # ``reaches`` is 0 for NaN, which so counts as 1.
     bounded_misfit = sp.Function("select")(sp.Function("reaches")(sp.S.One, symbol("RATIO")), symbol("RATIO"), sp.S.One)
     lines = [("RATIO", misfit), ("KEPT", bounded_misfit), ("FALL", symbol("MISFIT") - symbol("KEPT"))]
-    return source_text + loop("finish_misfit", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"})
+    return source_text + loop(
+        "finish_misfit", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"}
+    )
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from estimator.compilation.simd import jit_closure, number_rows
+from estimator.compilation.simd import LANES, jit_closure, number_rows
 from estimator.engine.storage_layout import belief_rows, integrator_rows, trace_rows, update_layout
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
@@ -239,6 +239,11 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     missing = [name for name in dict.fromkeys(row_names) if name not in row_of]
     row_of |= number_rows(" ".join(missing), first_row=len(row_of))
     return row_of | model_input_rows(spec, belief, row_of)
+
+
+def block_offsets(spec: KernelSpec) -> dict[str, int]:
+    """Name of a quantity to the place of its first lane in a flat block."""
+    return {name: row * LANES for name, row in block_layout(spec).items()}
 
 
 def missing_mean_field_rows(spec: KernelSpec) -> list[str]:

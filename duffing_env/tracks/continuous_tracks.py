@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.model import Model
@@ -169,3 +170,9 @@ class ContinuousOutputEnv(ContinuousEnv):
 
     * v1: Eq. (1) in place of Eq. (2), and noises that nobody knows
     """
+
+
+class ContinuousVectorEnv(DuffingVectorEnv):
+    """Many `ContinuousEnv` at once."""
+
+    single_env_class: ClassVar[type[DuffingEnv]] = ContinuousEnv

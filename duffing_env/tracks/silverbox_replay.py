@@ -11,8 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from duffing_env.env import DuffingEnv
+from duffing_env.env_base import ReadOnlyOption
 from duffing_env.experiment_config import Experiment
 from duffing_env.plants.silverbox_record import REGIME_NAMES, Regime, load_record
+from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
@@ -89,6 +91,11 @@ class ReplayExperiment(Experiment):
         return self._regime.u, self._regime.y
 
     @property
+    def recorded_input(self) -> FloatArray:
+        """The regime's input [V]."""
+        return self._regime.u
+
+    @property
     def plant_params(self) -> dict[str, Any]:
         """How the record is played, and how the estimator departs from the model."""
         return {"as_published": self.as_published, "input_delay": self.input_delay}
@@ -148,7 +155,14 @@ class SilverboxReplayEnv(DuffingEnv):
     experiment_class: ClassVar[type[Experiment]] = ReplayExperiment
     _info_flags: ClassVar[tuple[str, ...]] = ("diverged", "off_record")
 
-    @property
-    def recorded_input(self) -> FloatArray:
-        """The inputs that the record can answer, in order [V]."""
-        return self.experiment.replayed_record[0]
+    #: The inputs that the record can answer, in order [V].
+    recorded_input = ReadOnlyOption("recorded_input", "experiment.recorded_input")
+
+
+class SilverboxReplayVectorEnv(DuffingVectorEnv):
+    """Many `SilverboxReplayEnv` at once; all rows replay the same record."""
+
+    single_env_class: ClassVar[type[DuffingEnv]] = SilverboxReplayEnv
+
+    #: As `SilverboxReplayEnv.recorded_input`.
+    recorded_input = ReadOnlyOption("recorded_input", "experiment.recorded_input")

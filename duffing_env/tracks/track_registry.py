@@ -40,7 +40,7 @@ def _difference_track(entry_point: str, **overrides: Any) -> dict[str, Any]:
 
 def _continuous_track(env_class: str, **overrides: Any) -> dict[str, Any]:
     """A track on the differential equation, with what differs from Amplitude-v1."""
-    vector_entry_point = "vector_env:ContinuousVectorEnv"
+    vector_entry_point = "tracks.continuous_tracks:ContinuousVectorEnv"
     return _registration(
         f"tracks.continuous_tracks:{env_class}",
         vector_entry_point,
@@ -84,7 +84,9 @@ TRACKS: dict[str, dict[str, Any]] = {
     ),
     "duffing_env/Rig-v0": _registration("tracks.rig_env:RigEnv", "tracks.rig_env:RigVectorEnv", horizon=256),
     "duffing_env/SilverboxReplay-v0": _registration(
-        "tracks.silverbox_replay:SilverboxReplayEnv", "vector_env:SilverboxReplayVectorEnv", regime="multisine"
+        "tracks.silverbox_replay:SilverboxReplayEnv",
+        "tracks.silverbox_replay:SilverboxReplayVectorEnv",
+        regime="multisine",
     ),
 }
 

@@ -6,8 +6,7 @@ import pytest
 from playing import random_actions
 from twin import TwinContinuousEnv, assert_env_follows_twin
 
-from duffing_env.tracks.continuous_tracks import ContinuousEnv
-from duffing_env.vector_env import ContinuousVectorEnv
+from duffing_env.tracks.continuous_tracks import ContinuousEnv, ContinuousVectorEnv
 
 TRACK = "duffing_env/Amplitude-v1"
 #: As they are compiled for tests/specimens.py: the belief does not depend on the reward.

@@ -8,9 +8,9 @@ from reference.filters import continuous_step
 from scipy.integrate import solve_ivp
 from twin import to_rates
 
-from duffing_env.kernel import _compile_plant_step
 from duffing_env.kernel_stages.env_codegen import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
+from duffing_env.kernel_stages.sample_stages import compile_simulation
 from duffing_env.storage.kernel_spec import block_layout
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP
@@ -41,7 +41,7 @@ def compiled(kind):
     """The two functions that a sample of the plant takes."""
     assert block_layout(kind) == PLACE
     draw_noise = compile_noise_draw(PLACE)
-    return draw_noise, _compile_plant_step(kind, generated_functions(kind), draw_noise)
+    return draw_noise, compile_simulation(kind, generated_functions(kind), draw_noise)
 
 
 def step(by_row, process_noise=0.0, measurement_noise=0.0, kind=KIND):

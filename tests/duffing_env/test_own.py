@@ -7,7 +7,7 @@ import pytest
 from playing import assert_refused, random_actions, roll_out
 from specimens import all_that_is_given
 
-from duffing_env.custom_functions import Beliefs
+from duffing_env.belief_arrays import Beliefs
 from duffing_env.env import DuffingEnv
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.difference_equation import difference

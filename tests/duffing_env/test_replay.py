@@ -12,8 +12,7 @@ from twin import ITERATIONS, Moments
 
 from agents.policies import make_policy
 from duffing_env.plants.silverbox_record import RecordNotFound
-from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv
-from duffing_env.vector_env import SilverboxReplayVectorEnv
+from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv, SilverboxReplayVectorEnv
 from estimator import SILVERBOX_TWIN
 
 TRACK = "duffing_env/SilverboxReplay-v0"

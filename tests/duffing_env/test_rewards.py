@@ -77,7 +77,9 @@ class Lanes:
     def settle(self, input_cost=0.0, terminal=False, terminated_return=None):
         weights = REWARDS[self.reward].weights
         price = np.sqrt(input_cost)
-        self.code.finish_step(self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights)
+        self.code.finish_step(
+            self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights
+        )
         forfeits = terminated_return is not None
         if terminal or forfeits:
             payer(self.kernel_spec)(self.rows.reshape(-1), terminal, forfeits, terminated_return or 0.0)

@@ -1,0 +1,37 @@
+"""The compiled functions of a reward that the kernel calls at fixed points of a step."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from estimator.compilation.simd import jit
+
+
+class RewardHooks(NamedTuple):
+    """Work of a reward's own, compiled into the kernel; it leaves its result in row ``WORK``.
+
+    Attributes:
+        on_episode_start: ``on_episode_start(W, j, params)`` where an episode begins in lane j, or its truth changes.
+        before_plant_step: ``before_plant_step(W, params)`` before the plant moves.
+        before_update: ``before_update(W, params)`` before the belief is updated.
+        after_update: ``after_update(W, params)`` after it.
+    """
+
+    on_episode_start: Any
+    before_plant_step: Any
+    before_update: Any
+    after_update: Any
+
+
+@jit
+def no_hook(W, params):
+    """A hook that has nothing to do."""
+
+
+@jit
+def no_lane_hook(W, j, params):
+    """The same, of one lane."""
+
+
+#: The hooks of a reward that is a weighted sum alone.
+NO_HOOKS = RewardHooks(no_lane_hook, no_hook, no_hook, no_hook)
