@@ -1,1 +1,1 @@
-"""Timed comparisons: `python -m benchmarks`. What is measured, and the last results: ``docs/benchmarks.md``."""
+"""Timed benchmarks: `python -m benchmarks`; ``docs/benchmarks.md`` describes them and has the last results."""

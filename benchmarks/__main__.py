@@ -104,7 +104,7 @@ def print_head(machine: dict[str, Any], versions: dict[str, dict[str, str]], rep
 
 
 def cpuinfo() -> dict[str, str]:
-    """What Linux tells of the first processor, by its names; its name alone, or nothing, elsewhere."""
+    """Linux's description of the first processor, by its names; the processor's name alone, or nothing, elsewhere."""
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:

@@ -1,6 +1,7 @@
-"""The compiled pieces of a step, called apart: the plant alone, and the estimator alone.
+"""Timing of the compiled components of a step: the plant alone, and the estimator alone.
 
-They are the functions that the environment's kernel calls, over blocks of the same kind, once per sample from Python.
+They are the functions that the environment's kernel calls, on blocks of the same kind, called once per sample from
+Python.
 """
 
 from collections.abc import Callable

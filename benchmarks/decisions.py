@@ -1,4 +1,4 @@
-"""Section 4: what a decision of a network takes, features and shield included, on one thread."""
+"""Section 4: time of a policy network's decision, with features and shield, on one thread."""
 
 import time
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from benchmarks.timed_rounds import Row, measure
 BARS = {("Amplitude-v0", "ppo/amplitude"): (15.0, 3.0), ("Amplitude-v1", "ppo/amplitude-v1"): (30.0, 6.0)}
 MANY = 1024
 
-#: Samples until observations are those of an episode on its way.
+#: Samples before timing, so that observations are from the middle of an episode.
 _SETTLED = 40
 
 
@@ -32,7 +32,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 
 def _decisions(track: str, name: str, count: int) -> Callable[[int], tuple[float, float]]:
-    """Decisions for so many environments, which stand still meanwhile."""
+    """Decisions for a number of environments that are not stepped meanwhile."""
     envs = gym.make_vec(f"duffing_env/{track}", num_envs=count, vectorization_mode="vector_entry_point")
     policy = make_policy(name, envs)
     observations, _ = envs.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Section 1: the estimator on the Silverbox record, beside the filters that people reach for."""
+"""Section 1: speed of the estimator on the Silverbox record, beside common filters of other packages."""
 
 from collections.abc import Callable
 from pathlib import Path

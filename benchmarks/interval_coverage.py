@@ -1,6 +1,7 @@
-"""Coverage: how often the posterior's 90 % intervals hold the truth, on systems drawn from the prior.
+"""Coverage of credible intervals: how often the posterior's 90 % intervals contain the truth, over the prior's systems.
 
-``python -m benchmarks.interval_coverage`` prints the tables of docs/coverage.md, docs/continuous.md and docs/estimators.md.
+``python -m benchmarks.interval_coverage`` prints the tables of docs/coverage.md, docs/continuous.md and
+docs/estimators.md.
 """
 
 import dataclasses
@@ -20,10 +21,17 @@ from estimator.belief import Belief
 from estimator.inference import EXPECTATIONS
 from estimator.support.array_types import FloatArray
 
+#: Probability of the intervals.
 LEVEL = 0.90
+
+#: Half width of the intervals, in standard deviations.
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))
-NOISE_SHAPE = 2.0  # of both Gamma priors: weak
-HYPOTHESES = 9  # noise ratios of an ensemble
+
+#: Shape of the noises' Gamma priors: weak.
+NOISE_SHAPE = 2.0
+
+#: Noise ratios of an ensemble.
+HYPOTHESES = 9
 
 NOISES = ((2e-3, 1e-3), (2e-3, 1e-4), (5e-4, 5e-4), (1e-4, 3e-4))
 LENGTHS = (256, 2048)
@@ -48,9 +56,9 @@ class Case:
         measurement_noise: standard deviation of v [V].
         samples: length of each record.
         noise_centers: standard deviations [V] at which the priors of γ and of ξ are centred.
-        population: one of `benchmarks.random_systems.POPULATIONS`; or ``track``, the plants of `TRACK` without its limit.
-        spread: of the population.
-        factorisation: of the estimator, ``structured`` or ``mean_field``.
+        population: one of `benchmarks.random_systems.POPULATIONS`; or ``track``, the plants of `TRACK` without limit.
+        spread: relative half width of the population's parameters.
+        factorisation: factorisation of the estimator, ``structured`` or ``mean_field``.
         hypotheses: noise ratios that the estimator weighs.
         expectations: ``first_order`` or ``sigma_points``.
         estimator: of ``track``, which identifies within the environment: ``ode`` or ``nlarx``.

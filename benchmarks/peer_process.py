@@ -1,4 +1,4 @@
-"""Processes that run rows for the benchmark, and the peers' own environment, in which one of them is."""
+"""Child processes that run rows of the benchmark, among them the peers in their own virtual environment."""
 
 import hashlib
 import json
@@ -62,7 +62,7 @@ class Child:
     Args:
         command: that starts it.
         cwd: where it runs; None for here.
-        settings: of its environment, besides those of this process.
+        settings: environment variables, besides this process's.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Child:
         return process.returncode
 
     def row(self, name: str, title: str, unit: str) -> Row:
-        """The row that the process knows by ``name``, under a title of ours."""
+        """The process's row ``name``, under a title of ours."""
 
         def run(count: int) -> tuple[float, float]:
             answer = self.ask(name, count)

@@ -1,12 +1,12 @@
-"""The peers' rows. Runs in the peers' own environment, as a child of the benchmark, and imports nothing of ours.
+"""The rows of peer packages. Runs in the peers' own environment, as a child of the benchmark, and imports none of ours.
 
 ``python -I peers.py SAMPLES.npz`` reads a request per line, ``["row", count]``, runs that row, ``count`` times as
-long, and answers with a line: ``{"seconds": ..., "work": ...}`` or ``{"error": ...}``. Each row is set up when it is
-first asked for, so that a peer that is missing costs its own rows only. The request ``["versions", 0]`` answers with
-versions. So the benchmark can alternate between its own rows and these.
+long, and answers with a line: ``{"seconds": ..., "work": ...}`` or ``{"error": ...}``. Each row is set up at its first
+request, so that a missing peer costs its own rows only. The request ``["versions", 0]`` returns versions. So the
+benchmark can alternate between its own rows and these.
 
-What is counted as work: env-steps, without the steps of ``NEXT_STEP`` autoreset, which only start an episode; or
-samples. Every row covers whole episodes, its resets included.
+Work counts env-steps, without the steps of ``NEXT_STEP`` autoreset, which only start an episode; or samples. Every row
+covers whole episodes with their resets.
 """
 
 import json

@@ -1,8 +1,8 @@
-"""The tests that compute, under several instruction sets of one machine: `make portability`.
+"""Runs the numerical tests under several instruction sets of one machine: `make portability`.
 
-A processor decides how a sum is grouped, whether a product is rounded before it is added, and which polynomial stands
-for a tanh. So does a setting of the libraries, and it lets one machine compute as others would. A test that fails here
-under one setting and passes under another has a bound that was taken from a machine instead of from the arithmetic.
+The processor decides how a sum is grouped, whether a product is rounded before it is added, and which polynomial
+computes a tanh. Settings of the libraries do so too, and let one machine compute as others would. A test that fails
+under one setting and passes under another has a bound from a machine instead of from the arithmetic.
 """
 
 import os
@@ -111,7 +111,7 @@ def _numpy_features() -> list[str]:
 
 
 def processor_features() -> set[str]:
-    """The features of this machine's processor, by Linux's names; empty where they are not told."""
+    """The features of this machine's processor, by Linux's names; empty where they are unknown."""
     return set(cpuinfo().get("flags", "").split())
 
 
@@ -130,7 +130,7 @@ def run(setting: Setting, workers: int, caches: Path) -> Outcome:
     Raises:
         OSError: if the tests did not start; what they said is printed.
     """
-    # Kernels depend on Numba's setting alone: those of other settings share one cache.
+    # Kernels depend on Numba's setting alone: all other settings share one cache.
     cache = caches / setting.variables.get("NUMBA_CPU_NAME", "host")
     report = caches / "report.xml"
     report.unlink(missing_ok=True)
@@ -150,7 +150,7 @@ def run(setting: Setting, workers: int, caches: Path) -> Outcome:
 
 
 def read_report(path: Path, seconds: float) -> Outcome:
-    """What a report of pytest (JUnit XML) says."""
+    """The outcomes in a pytest report (JUnit XML)."""
     passed, failed = 0, []
     for case in ElementTree.parse(path).getroot().iter("testcase"):
         kinds = {child.tag for child in case}

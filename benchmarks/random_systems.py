@@ -1,9 +1,10 @@
-"""Systems for the coverage tables: drawn at random and simulated, with the prior that has the moments of the draw.
+"""Random systems for the coverage tables: drawn and simulated, with the prior that has the moments of the draw.
 
-Every population has the four parameters of an oscillator near the twin of the Silverbox; what else it has is Gaussian
-about 0. The difference equations start at rest, under inputs that are independent and uniform. So are those of ``ode``;
-but its start tells its offsets apart, and is therefore drawn as the prior has it. ``wide`` is the same equation under a
-prior that is wide beside what a sample tells: Gaussian, under three times the multisine of the Silverbox, from rest.
+Every population has the four parameters of an oscillator near the twin of the Silverbox; further parameters are
+Gaussian about 0. The difference equations start at rest, under independent uniform inputs. ``ode`` has such inputs too,
+but its initial state separates its offsets, and is therefore drawn from the prior. ``wide`` is the same equation under
+a Gaussian prior that is wide beside the information of a sample, under three times the multisine of the Silverbox, from
+rest.
 """
 
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ class Systems:
 
 
 def make_model(population: str) -> Model:
-    """What a population in `POPULATIONS` obeys."""
+    """The equation of a population in `POPULATIONS`."""
     return ODE if population in ("ode", "wide") else difference(population)
 
 
@@ -80,7 +81,7 @@ def make_rig(population: str) -> Rig:
 
 
 def names_of(population: str) -> tuple[str, ...]:
-    """Names of the coefficients in the tables: a difference equation's are those of what they multiply."""
+    """Names of the coefficients in the tables: in a difference equation, the names of the terms that they multiply."""
     if make_model(population).is_continuous:
         return tuple(ODE.coefficients)
     return ("θ1", "θ2", "θ3", "η") if population == "paper" else tuple(t.expression for t in PRESETS[population])
@@ -186,7 +187,7 @@ def _normal_factors(systems: int, spread: float, rng: np.random.Generator) -> Fl
 
 
 def _ode_coefficients(factors: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(N, 7) those of `ODE`, from factors (N, 4) of `_DRAWN`; offsets and feedthrough are drawn."""
+    """(N, 7) coefficients of `ODE`, from factors (N, 4) of `_DRAWN`; offsets and feedthrough are drawn."""
     systems = len(factors)
     truth = dict(zip(ODE.coefficients, np.tile(recorded_prior(ODE).coefficients_mean, (systems, 1)).T, strict=True))
     for coefficient, factor in zip(_DRAWN, factors.T, strict=True):

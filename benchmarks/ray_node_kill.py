@@ -1,11 +1,11 @@
-"""Five seeds on a Ray cluster of two nodes, of which one is killed in mid-training; and the same seeds without Ray.
+"""Trains five seeds on a Ray cluster of two nodes, kills one node in mid-training, and compares with runs without Ray.
 
 $ python -m benchmarks.ray_node_kill
 
-Both nodes are processes of this machine, with processes of their own for the seeds. Those of one get SIGKILL, all at
-once, as if it had lost its power. The exit status is the number of seeds that are not as they should be: finished, with
-the weights that they have without Ray, bit for bit, and with at most the samples between two checkpoints lost. Needs
-Ray: it runs in the environment of ``make compat``.
+Both nodes are processes of this machine, with their own processes for the seeds. All processes of one node get SIGKILL
+at once, as in a loss of power. The exit status is the number of failed seeds. A seed passes if it finishes with the
+weights of the run without Ray, bit for bit, and loses at most the samples between two checkpoints. Needs Ray: it runs
+in the environment of ``make compat``.
 """
 
 import csv
@@ -69,7 +69,7 @@ def steps_of(row: dict[str, str]) -> int:
 
 
 def begun_at(run: Path) -> list[int]:
-    """Samples that each attempt went on from: in the first row of one there is no update to tell of."""
+    """Samples from which each attempt continued: the first row of an attempt has no update."""
     return [steps_of(row) - ROLLOUT for row in rows(run) if not row["train/n_updates"]]
 
 

@@ -1,7 +1,7 @@
-"""Whether two versions of this project compute the same: ``python -m benchmarks.regression --commit REV``.
+"""Compares the numbers of two versions of this project: ``python -m benchmarks.regression --commit REV``.
 
-Episodes of every track, `identify` on every shipped rig, decisions of ``efe`` and of every shipped policy, and
-``reproduce.py``, compared number by number. Each version runs from a tree of its own in a process of its own.
+It compares episodes of every track, `identify` on every shipped rig, decisions of ``efe`` and of every shipped policy,
+and ``reproduce.py``, number by number. Each version runs in its own tree and process.
 """
 
 import os

@@ -1,6 +1,6 @@
-"""The results of one version of this project, into an archive of arrays. Runs as a child of `benchmarks.regression`.
+"""Writes the results of one version of this project into an archive of arrays, as a child of `benchmarks.regression`.
 
-It runs in that version's tree, so it uses public names alone: those that every version has.
+It runs in that version's tree, so it uses only public names that every version has.
 """
 
 import contextlib

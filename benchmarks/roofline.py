@@ -1,10 +1,11 @@
-"""Section 4a: how near the compiled step comes to what this processor can do, and what keeps it from getting nearer.
+"""Section 4a: roofline of the compiled step: its share of this processor's peak, and the operations that take the time.
 
-The yardsticks are compiled the same way as the step (`estimator.compilation.simd.lanewise`): multiply-adds, divisions, square
+The yardsticks are compiled as the step is (`estimator.compilation.simd.lanewise`): multiply-adds, divisions, square
 roots and copies on independent values that stay in the nearest cache. Everything here runs on one thread.
 
-Operations are counted in what `estimator.compilation.scalar_jit` gives to LLVM, where each stands once for every lane. The compiler
-still finds an expression or two that are written twice; divisions and roots are as many in the assembly.
+Operations are counted in the code that `estimator.compilation.scalar_jit` gives to LLVM, once for every lane. The
+compiler still merges an expression or two that are written twice; the assembly has the same number of divisions and
+roots.
 """
 
 import re
@@ -97,7 +98,7 @@ _YARDSTICKS = {
     _STORES: (move, "store"),
 }
 
-#: Arguments of lane functions that are blocks: that of the systems, and of what is written beside it.
+#: Arguments of lane functions that are blocks: the block of the systems, and the block of the results beside it.
 _BLOCKS = ("W", "B")
 
 #: An instruction of LLVM's to what it is counted as.
@@ -205,7 +206,7 @@ def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float
 
 
 def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], float]:
-    """A piece of the step, again and again on blocks that lie in the nearer caches as those of the step do."""
+    """A piece of the step, repeated on blocks that lie in the nearer caches as in the step."""
     initial, call = plants(SIZE, factorisation), _calls(functions)
     blocks, beside = initial.copy(), np.zeros(initial.shape[1])
 

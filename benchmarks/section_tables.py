@@ -1,4 +1,4 @@
-"""Sections of the benchmark as they are printed and written: ratios first, then rows, then notes."""
+"""Tables of the benchmark's sections, printed and written: ratios first, then rows, then notes."""
 
 import math
 from collections.abc import Sequence

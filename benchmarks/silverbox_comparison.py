@@ -1,8 +1,8 @@
-"""The peers in the Silverbox protocol, beside our estimators: same record, model, prior and tests, timed in turns.
+"""Compares peer packages with our estimators in the Silverbox protocol: same record, model, prior and tests.
 
-What a peer needs and does not learn, it gets: our prior, the two noise variances as ours had learned them at the end of
-the training section, and float64. Its coefficients are simulated by our own free run, started by a filter with its
-noises, so that nothing but the identification differs; fastcan's model is simulated by fastcan.
+A peer gets all that it needs and does not learn: our prior, our estimates of the two noise variances at the end of the
+training section, and float64. Our free run simulates its coefficients, started by a filter with its noises, so that
+only the identification differs; fastcan simulates its own model. All rows are timed in turns.
 """
 
 import tempfile
@@ -76,7 +76,7 @@ _DIRECTION = np.array([1.0, 2.0])
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """What a row of the comparison came to.
+    """The results of a row of the comparison.
 
     Attributes:
         errors: root mean square simulation error by test [V].

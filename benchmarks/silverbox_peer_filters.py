@@ -1,9 +1,9 @@
-"""The peers' estimators. Runs in the peers' environment (`benchmarks.peers`), imports none of ours.
+"""Filters of peer packages on the Silverbox record. Runs in the peers' environment (`benchmarks.peers`).
 
-`benchmarks.estimators` times them with the paper's model. In the Silverbox protocol every online peer goes once through
-the training section and, where it makes forecasts, on through the multisine test; `benchmarks.silverbox_comparison` writes what it
-is given, and judges what it comes to. Models are in the coordinates of
-`estimator.models`: the state and the coefficients together are Gaussian, and the coefficients stay.
+It imports nothing of ours. `benchmarks.estimators` times the filters with the paper's model. In the Silverbox protocol
+every online peer goes once through the training section and, where it makes forecasts, on through the multisine test;
+`benchmarks.silverbox_comparison` writes its inputs and judges its results. Models are in the coordinates of
+`estimator.models`: the state and the coefficients together are Gaussian, and the coefficients are constant.
 """
 
 import time
@@ -24,7 +24,7 @@ FASTCAN_TERMS, FASTCAN_DELAY, FASTCAN_DEGREE = 15, 3, 3
 
 @dataclass(frozen=True)
 class Model:
-    """What a filter estimates: a joint state of two states and the coefficients.
+    """The model of a filter: a joint state of two states and the coefficients.
 
     Attributes:
         mean: (n,) predicted for the first sample.

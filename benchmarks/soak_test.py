@@ -1,13 +1,12 @@
-"""Long runs on every track and of filters: are numbers finite and in bounds, covariances sound, and memory flat?
+"""Soak test: long runs on every track and of filters, with checks of numbers, covariances and memory.
 
 $ python -m benchmarks.soak_test --steps 10000000
 $ python -m benchmarks.soak_test --steps 1000000 --runs Short-v0 Rig-v0 filter-duffing
 
-A track's samples are shared among four kinds of actions (random, constant, alternating, at the believed resonance) and
-as many with extreme options. A filter goes over one record, played again and again. Every covariance of a track is
-looked at after every 64th sample, and that of a filter after every 16,384th. The exit status is 1 where a number was
-not finite or out of bounds, a covariance not positive semi-definite, or where memory grew by more than 2 MB in the
-second half of a run.
+A track's samples are shared among four kinds of actions (random, constant, alternating, at the believed resonance),
+with usual and with extreme options. A filter repeats one record. The covariances of a track are checked after every
+64th sample, the covariance of a filter after every 16,384th. The exit status is 1 where a number was not finite or out
+of bounds, a covariance not positive semi-definite, or where memory grew by more than 2 MB in the second half of a run.
 """
 
 import json
@@ -92,7 +91,7 @@ def _rig(limit: float, span: float) -> Rig:
 
 
 def soak(name: str, steps: int) -> dict[str, int]:
-    """What a track's samples came to."""
+    """Run a track's samples, and check them."""
     counts = dict.fromkeys(COUNTED, 0)
     usual: dict[str, Any] = {"rig": _rig(6.0, 0.03)} if "Rig" in name else {}
     extreme = {"rig": _rig(600.0, 30.0)} if "Rig" in name else {} if "Replay" in name else _EXTREME
@@ -124,7 +123,7 @@ def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Gener
 
 
 def filtered(name: str, steps: int) -> dict[str, int]:
-    """What a filter's samples came to, over a record that is played again and again."""
+    """Run a filter over a repeated record, and check its samples."""
     estimator, counts, before = OnlineEstimator(FILTERS[name]()), dict.fromkeys(COUNTED, 0), 0
     rng = np.random.default_rng(0)
     u = 0.02 * rng.standard_normal(_PIECE)

@@ -1,4 +1,4 @@
-"""Section 7: what one waits for before the first step, and how much memory many environments take."""
+"""Section 7: time before the first step, and memory of many environments."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Rows that are timed in turns: all of them once, then all again, so that a busy moment of the machine hits all."""
+"""Times rows in rounds: all of them once, then all again, so that a busy moment of the machine affects all rows."""
 
 import math
 import os
@@ -43,7 +43,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Result:
-    """What a row took.
+    """The times of a row.
 
     Attributes:
         name: of the row.

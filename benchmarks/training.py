@@ -1,6 +1,6 @@
-"""Section 3: the whole loop of PPO, and the time from starting ``train.py`` to a useful policy.
+"""Section 3: speed of the whole PPO loop, and the time from starting ``train.py`` to a useful policy.
 
-Useful: the 95 % interval of its log posterior gain over 256 systems lies above that of every fixed excitation.
+A policy is useful if the 95 % interval of its log posterior gain over 256 systems lies above every fixed excitation's.
 """
 
 import math
@@ -123,7 +123,7 @@ def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> f
 def _train_a_while(output: Path, seed: int, cache: Path) -> list[Path]:
     """Run ``train.py`` as it is, up to a checkpoint that must be useful; the checkpoints so far, in order.
 
-    Its schedule is that of a whole run, of which this is the beginning.
+    It is the beginning of a whole run, with the whole run's schedule.
     """
     words = f"--output {output} --seed {seed} --checkpoints {CHECKPOINTS}".split()
     command = [sys.executable, "train.py", *words]

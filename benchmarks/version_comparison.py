@@ -1,6 +1,6 @@
-"""This version beside an older one: ``python -m benchmarks.version_comparison --commit REV``.
+"""Compares the speed of this version with an older one: ``python -m benchmarks.version_comparison --commit REV``.
 
-Each version runs from a tree of its own in a process of its own, and both are timed in turns.
+Each version runs in its own tree and process, and both are timed in turns.
 """
 
 import subprocess

@@ -1,6 +1,6 @@
-"""The rows of one version of this project. Runs as a child of `benchmarks.version_comparison`, in that version's tree.
+"""The timed rows of one version of this project, run as a child of `benchmarks.version_comparison` in its tree.
 
-It is spoken to like `benchmarks.peers`. Versions before the engine (`estimator.engine`) had other names for the update.
+It answers requests as `benchmarks.peers` does. Versions before `estimator.engine` had other names for the update.
 """
 
 import json

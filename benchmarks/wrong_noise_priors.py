@@ -1,7 +1,8 @@
-"""Noises that nobody knows: what wrong priors of them cost, in coverage and in nats.
+"""The cost of wrong noise priors, in coverage and in nats.
 
-``python -m benchmarks.wrong_noise_priors`` prints tables of docs/coverage.md. The priors of both noises are centred at multiples of
-the truth. Systems, noises and inputs are the same in every row, and in that of an estimator that is told the noises.
+``python -m benchmarks.wrong_noise_priors`` prints tables of docs/coverage.md. The priors of both noises are centred at
+multiples of the truth. Systems, noises and inputs are the same in every row, also for an estimator with the true
+noises.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ PLAYED = {
 }
 NOISE, SAMPLES = 5e-4, 256  # V
 
-#: What an estimator is told of noises that are known, and what one is that a rig brings (`estimator.OnlineEstimator`).
+#: Options of an estimator with known noises, and of one with a rig's noises (`estimator.OnlineEstimator`).
 KNOWN: dict[str, Any] = {"noise_hypotheses": 1, "noise_shape": 1e6}
 HYPOTHESES = (7, 7)
 

@@ -1,4 +1,4 @@
-"""A batch of experiments: the memory that the kernel works on. Both faces of the environment stand on it."""
+"""A batch of experiments: the arrays that the kernel steps, for single and vector environments."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from estimator.support.array_types import FloatArray
 
 _OUTCOME_NAMES = tuple(name.lower() for name in OUTCOME_ROWS)
 
-#: The process whose threads have stepped: they do not live on in its children.
+#: Process that has stepped with Numba's threads, which its children do not inherit.
 _threaded_process: int | None = None
 
 _threading_lock = threading.Lock()
@@ -41,17 +41,17 @@ class Batch:
     """n experiments of one kind, stepped together.
 
     Args:
-        experiment: what is fixed about them.
-        size: their number n; memory is laid out for a multiple of `LANES`.
+        experiment: the fixed options of the experiments.
+        size: number n of experiments; memory is laid out for a multiple of `LANES`.
         reset_mode: `duffing_env.kernel.RESET_MANUALLY`, ``RESET_NEXT_STEP`` or ``RESET_SAME_STEP``.
-        threads: threads that step the blocks; results do not depend on it.
-        hold: samples that a step plays, at most: an environment stops where its episode ends.
-        max_samples: samples after which episodes are cut off.
+        threads: number of threads that step the blocks; results do not depend on it.
+        hold: largest number of samples in a step: an environment stops where its episode ends.
+        max_samples: samples after which episodes are truncated.
 
     Attributes:
         observations: (n, entries) float32, overwritten by every step, unless `renew_output_arrays` is called before.
-        final_observations: the same, for what was reset within the step; always overwritten.
-        outcomes: (len(OUTCOME), n), as the observations.
+        final_observations: the same, for environments that were reset within the step; always overwritten.
+        outcomes: (len(OUTCOME_ROWS), n), overwritten like the observations.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Batch:
         )
         self._truth_scales = np.array([parameter_scale(experiment, name) for name in self._truth_rows])
         n_rows, n_observation = max(self._row_of.values()) + 1, len(observation_bounds(experiment.model))
-        # Copies, because read-only arrays are another type to Numba, and would compile the step anew.
+        # A copy: Numba types a read-only array differently, and would compile the step anew.
         self._replayed_record = np.stack(experiment.replayed_record)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
@@ -98,7 +98,7 @@ class Batch:
         self.renew_output_arrays()
         self._final_observations = np.zeros_like(self._observations)
         self.final_observations = self._final_observations[:size]
-        # Lanes beyond the last environment do the same work as the others, so that none of them runs wild.
+        # Lanes beyond the last environment run as well: a reset keeps their numbers finite.
         self._mask = np.ones(padded, dtype=np.bool_)
         self._reset_masked()
         self._mask[size:] = False
@@ -118,10 +118,10 @@ class Batch:
         self._run_kernel(RESET_ONLY)
 
     def parse_truth(self, truth: Any) -> FloatArray:
-        """(size, quantities) what ``reset(options={"truth": ...})`` asks for, inside, for `restart_with_truth`: NaN what is drawn.
+        """The truth of ``reset(options={"truth": ...})`` as (size, quantities) internal numbers, NaN where drawn.
 
         Raises:
-            ValueError: for what is no such truth, naming the parameter.
+            ValueError: for an invalid truth, with the name of the parameter.
         """
         if not isinstance(truth, list | tuple):
             return self._parse_one_truth(truth, "truth", self.size)
@@ -134,7 +134,7 @@ class Batch:
         return chosen
 
     def _parse_one_truth(self, truth: Any, label: str, size: int) -> FloatArray:
-        """(size, quantities) of one truth for so many environments."""
+        """(size, quantities) internal numbers of one truth, for ``size`` environments."""
         experiment = self.experiment
         names, parameters = list(self._truth_rows), list(parameter_names(experiment.truth_model))
         if experiment.plant is None:
@@ -158,9 +158,9 @@ class Batch:
         return chosen / self._truth_scales
 
     def restart_with_truth(self, mask: npt.NDArray[np.bool_], truth: FloatArray) -> None:
-        """Begin the episodes of ``mask``, which were just reset, once more: with these systems, and the same noise.
+        """Restart the episodes of ``mask``, which were just reset, with chosen plants and the same noise.
 
-        What ``truth`` has as NaN stays as it was drawn: all of a row, or its standard deviations.
+        NaN in ``truth`` keeps the drawn numbers: of a whole row, or of its standard deviations.
         """
         params, n = self._params, len(parameter_names(self.experiment.truth_model))
         kept_rows = [place for name, place in self._row_of.items() if name.startswith(("STREAM_", "JUMP_"))]
@@ -179,10 +179,10 @@ class Batch:
             self._blocks[b, kept_rows, lane] = kept_values
 
     def renew_output_arrays(self, *, observations: bool = True) -> None:
-        """Keep the arrays of the last step as they are, for as long as anybody holds them: the next gets others.
+        """Let the next step write into other arrays, so that referenced arrays of the last step stay as they are.
 
         Args:
-            observations: whether those of the observations too, and not only those of the outcomes.
+            observations: whether to renew the observations, besides the outcomes.
         """
         self._outcomes = self._outcome_pool.acquire()
         self.outcomes = self._outcomes[:, : self.size]
@@ -191,7 +191,7 @@ class Batch:
             self.observations = self._observations[: self.size]
 
     def step(self, actions: npt.ArrayLike) -> None:
-        """Apply actions (n,) for a step: in parts of the largest input, clipped to [-1, 1], in float32's range."""
+        """Apply actions (n,) for a step, in parts of the largest input; float32, clipped to [-1, 1]."""
         self._actions[: self.size] = actions
         self._run_kernel(self._reset_mode)
 
@@ -199,8 +199,8 @@ class Batch:
         self, reset_mode: int, packed_params: FloatArray | None = None, blocks: tuple[int, int] | None = None
     ) -> None:
         arguments = (
-            self._actions, self._packed_params if packed_params is None else packed_params, self._replayed_record, reset_mode, self._mask,
-            self._observations, self._outcomes, self._final_observations, self._flat_ended,
+            self._actions, self._packed_params if packed_params is None else packed_params, self._replayed_record,
+            reset_mode, self._mask, self._observations, self._outcomes, self._final_observations, self._flat_ended,
         )  # fmt: skip
         if blocks is not None:
             self._kernel.step(*blocks, self._flat_blocks, self._members, self._workspace[0], *arguments)
@@ -212,31 +212,31 @@ class Batch:
 
     @property
     def memory(self) -> dict[str, npt.NDArray[Any]]:
-        """All that the next step goes on from, and what the last one showed: the arrays themselves."""
+        """The state from which the next step continues, and the last observations: the arrays themselves."""
         return {"blocks": self._blocks, "members": self._members, "observations": self._observations}
 
     def set_measured_sample(self, u: float, y: float) -> None:
-        """Let the next step play this input and output [V], of an experiment that replays a record of one sample."""
+        """Set the input and output of the next step, in an experiment that replays a record of one sample."""
         self._replayed_record[:, 0] = u, y
 
     def outcome(self, index: int) -> dict[str, float]:
-        """What the last step left behind for one environment, by its names in lower case."""
+        """The outcome of the last step for one environment, by names in lower case."""
         return dict(zip(_OUTCOME_NAMES, self._outcomes[:, index].tolist(), strict=True))
 
     def row_values(self, name: str) -> FloatArray:
-        """(n,) current values of a row, such as what the last step left behind; a copy."""
+        """(n,) current values of a row; a copy."""
         return self._blocks[:, self._row_of[name]].flatten()[: self.size]
 
     def records(self, ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as of `row_matrix`."""
+        """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as for `row_matrix`."""
         return self._gather_rows(slice(record_size(self.experiment.model)), ended)
 
     def row_matrix(self, names: Sequence[str], ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
         """(n, k) values of some rows; a copy.
 
         Args:
-            names: of the k rows.
-            ended: (n,) environments of which those are meant that their last episode ended with, if any.
+            names: names of the k rows.
+            ended: (n,) environments whose values are taken from the end of their last episode, if any.
         """
         return self._gather_rows([self._row_of[name] for name in names], ended)
 
@@ -245,11 +245,11 @@ class Batch:
         if ended is not None:
             last = self._ended[:, row_numbers].swapaxes(1, 2).reshape(len(self._blocks) * LANES, -1)[: self.size]
             found = np.where(ended[:, None], last, found)
-        # Of a single block that is a view, in another order, for which a kernel would be compiled once more.
+        # A single block would give a view in another memory order, for which Numba would compile a kernel anew.
         return np.array(found, order="C")
 
     def mixture(self, index: int) -> tuple[FloatArray, FloatArray]:
-        """Records (m, size) and weights (m,) of the beliefs that environment ``index`` weighs: one, or its members."""
+        """Records (m, size) and weights (m,) of environment ``index``: of its filter bank, or of its one belief."""
         count = len(self._params.hypothesis_priors)
         if not count:
             return self.records()[index : index + 1], np.ones(1)
@@ -264,15 +264,15 @@ class Batch:
         return self.beliefs(np.array([index]))[0]
 
     def beliefs(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Belief]:
-        """The beliefs of some environments; ``final``: those that their last episodes ended with, if reset since."""
+        """The beliefs of some environments: now, or with ``final`` at the end of their last episodes."""
         records = self._gather_adjacent_rows(indices, 0, record_size(self.experiment.model), final=final)
         records.flags.writeable = False
         return self._prior.with_records(records)
 
     def truth(self, ended: npt.NDArray[np.bool_] | None = None) -> Parameters:
-        """The true plants, a batch of n; where a record is replayed, the twin of its circuit. ``ended`` as of `row_matrix`.
+        """The true plants, a batch of n, with the standard deviations of their noises where these are drawn.
 
-        With the standard deviations of their noises, where those are drawn.
+        Where a record is replayed, the truth is the twin of its circuit. ``ended`` as for `row_matrix`.
         """
         values = self._truth_scales[:, None] * self.row_matrix(list(self._truth_rows.values()), ended).T
         return Parameters(zip(self._truth_rows, values, strict=True))
@@ -282,7 +282,7 @@ class Batch:
         return self.truths(np.array([index]))[0]
 
     def truths(self, indices: npt.NDArray[np.intp], *, final: bool = False) -> list[Parameters]:
-        """The true plants of some environments; ``final``: those of their last episodes, if reset since."""
+        """The true plants of some environments: now, or with ``final`` at the end of their last episodes."""
         first = self._row_of[next(iter(self._truth_rows.values()))]
         rows = (
             self._truth_scales * self._gather_adjacent_rows(indices, first, len(self._truth_rows), final=final)
@@ -299,7 +299,7 @@ class Batch:
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copies and pickles must not share memory through the views."""
+        """The state without views, so that copies and pickles share no memory through them."""
         state = self.__dict__.copy()
         for view in ("observations", "final_observations", "outcomes", "_flat_blocks", "_flat_ended", "_kernel"):
             del state[view]
@@ -316,7 +316,7 @@ class Batch:
 
 
 def parameter_scale(experiment: Experiment, name: str) -> float:
-    """What one inside is worth outside, of a parameter of the truth, or of a noise as the first sensor shows it."""
+    """Factor from the internal to the physical unit of a true parameter, or of a noise in the first sensor."""
     scales, model = experiment.scales, experiment.truth_model
     if name in model.dimensions:
         return scales.factor(model.dimensions[name])
@@ -324,7 +324,7 @@ def parameter_scale(experiment: Experiment, name: str) -> float:
 
 
 def spawn_seeds(seed: int | None, count: int) -> list[int]:
-    """Seeds of a batch's environments: the i-th does not depend on their number.
+    """Seeds of a batch's environments; the i-th seed does not depend on ``count``.
 
     A single environment that is reset with the i-th of them follows row i of a batch that is reset with ``seed``.
     """
@@ -333,11 +333,10 @@ def spawn_seeds(seed: int | None, count: int) -> list[int]:
 
 
 def numba_thread_context(n_threads: int) -> AbstractContextManager[object] | None:
-    """The context in which Numba may step with so many threads; None where it may not.
+    """The context in which Numba may step with ``n_threads`` threads; None where it may not.
 
-    It may not in the child of a process that has: one thread then does it all, with the same results. One of Numba's
-    threading layers can be entered by one Python thread at a time, and ends the process where two do: there they wait
-    for each other.
+    It may not in the child of a process that has stepped with threads; one thread then gives the same results. The
+    threading layer ``workqueue`` ends the process if two Python threads enter it at once, so there they wait.
     """
     import numba
 

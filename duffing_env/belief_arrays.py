@@ -1,4 +1,4 @@
-"""Beliefs of many environments as arrays, and the observations that can be asked for by name or by a function of them."""
+"""Beliefs of many environments as arrays, and the checks of observations, which are names or functions of them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import check_integer, short_repr
 from estimator.support.array_types import FloatArray
 
-#: Observations by name; see `duffing_env.env.DuffingEnv`.
+#: Names of observations; `duffing_env.env.DuffingEnv` describes them.
 OBSERVATIONS = ("posterior", "history", "privileged")
 
-#: Steps that the observation ``history`` shows, at most.
+#: Largest number of steps that the observation ``history`` shows.
 MAX_HISTORY = 10_000
 
-#: Entries of an observation that is a function of the belief are clipped to this.
+#: Bound to which the entries of an observation that is a function of the belief are clipped.
 OBSERVATION_BOUND = 10.0
 
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What n environments believe: `estimator.Belief`, as arrays.
+    """The beliefs of n environments as arrays, with the attributes of `estimator.Belief`.
 
     Attributes:
-        model: whose states and coefficients these are.
-        records: (n, size) their records.
-        scales: what one inside is worth outside, for physical parameters.
+        model: the model with these states and coefficients.
+        records: (n, size) flat records of the beliefs.
+        scales: factors from internal to physical units, for physical parameters.
     """
 
     model: Model
@@ -43,7 +43,7 @@ class Beliefs:
 
     @property
     def cov(self) -> FloatArray:
-        """(n, d, d) their covariances."""
+        """(n, d, d) covariances of states and coefficients."""
         return self.records[:, covariance_indices(self.model)]
 
     @property
@@ -63,12 +63,16 @@ class Beliefs:
         return self.records[:, -2 - 2 * self.model.n_outputs :]
 
     def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Means (n, p) and covariances (n, p, p) of the physical parameters, as `estimator.Belief.physical`."""
+        """Means (n, p) and covariances (n, p, p) of the physical parameters, as `estimator.Belief.physical` gives."""
         return propagate_to_physical(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
 
 
 def check_observation(observation: Any, history: int) -> None:
-    """Refuse what is no observation, or no number of steps."""
+    """Refuse an unknown observation, or a ``history`` that is no number of steps.
+
+    Raises:
+        ValueError: with the argument, its value and the valid ones.
+    """
     if not callable(observation) and not (isinstance(observation, str) and observation in OBSERVATIONS):
         raise ValueError(
             f"observation must be one of {list(OBSERVATIONS)} or a function, but is {short_repr(observation)}"

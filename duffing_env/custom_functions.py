@@ -1,7 +1,7 @@
-"""Observations and rewards beside the kernel's own: what an agent sees, and what it is paid for, by functions.
+"""Custom observations and rewards: user functions of the beliefs, and observations of history or of the truth.
 
-They are computed with NumPy, for all environments at once, from what the kernel leaves in its blocks. Both faces of the
-environment call them once a step, however many samples that holds.
+They run in NumPy, for all environments at once, on the blocks of the kernel. Single and vector environments call them
+once a step, whatever number of samples an action is held for.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _evaluate_observation(function: Any, records: FloatArray, experiment: Experi
 
 
 class BeliefRow(NamedTuple):
-    """One of `Beliefs`, for a compiled reward: the same attributes, without the first axis."""
+    """One belief of `Beliefs`, for a compiled reward: the same attributes without the first axis."""
 
     mean: FloatArray
     cov: FloatArray
@@ -61,13 +61,13 @@ class BeliefRow(NamedTuple):
 
     @classmethod
     def columns(cls, beliefs: Beliefs) -> tuple[FloatArray, ...]:
-        """The arrays of all, in the order of the fields."""
+        """The arrays of all beliefs, in the order of the fields."""
         return tuple(np.ascontiguousarray(getattr(beliefs, name)) for name in cls._fields)
 
 
 @cache
 def _compile_reward_loop(function: Any, parameters: tuple[str, ...]) -> Any:
-    """``loop(before_step, after, u, y, truth, paid)``: a compiled reward for one environment after the other."""
+    """``loop(before, after, u, y, truth, paid)``: a reward that the user compiled, called for each environment."""
     import numba
 
     fields = range(len(BeliefRow._fields))
@@ -82,11 +82,11 @@ def _compile_reward_loop(function: Any, parameters: tuple[str, ...]) -> Any:
 
 
 class CustomFunctions:
-    """What a batch shows and pays by functions.
+    """The custom observation and reward of a batch.
 
     Attributes:
-        observations: (n, entries) float32, after `start_episodes` and `observe_step`.
-        final_observations: the same, of the environments that were reset within the step.
+        observations: (n, entries) float32, set by `start_episodes` and `observe_step`.
+        final_observations: the same, for the environments that were reset within the step.
     """
 
     def __init__(self, batch: Batch) -> None:
@@ -105,12 +105,12 @@ class CustomFunctions:
 
     @staticmethod
     def for_batch(batch: Batch) -> CustomFunctions | None:
-        """That of a batch; None where the kernel does all."""
+        """The custom functions of a batch; None where the kernel computes observation and reward alone."""
         own = batch.experiment.observation != "posterior" or callable(batch.experiment.reward)
         return CustomFunctions(batch) if own else None
 
     def start_episodes(self, mask: Flags) -> None:
-        """See environments of ``mask`` (n,) whose episodes begin."""
+        """Observe the environments of ``mask`` (n,), whose episodes begin."""
         self._history[mask] = 0.0
         self.observations = self._select_observations(self._batch.observations, None)
 
@@ -120,13 +120,13 @@ class CustomFunctions:
         return {"samples": self._history, "shown": self.observations}
 
     def before_step(self) -> None:
-        """Remember what is believed before a step."""
+        """Remember the beliefs before a step."""
         self._needed_reset = self._batch.row_values("WAITING") != 0.0
         if callable(self._reward):
             self._records_before = self._batch.records()
 
     def step_rewards(self, ended: Flags | None) -> FloatArray:
-        """(n,) what a step paid, after it; 0 without a function.
+        """(n,) rewards of the last step by the user's function; 0 without one.
 
         Args:
             ended: (n,) environments that were reset within the step, if any.
@@ -154,7 +154,7 @@ class CustomFunctions:
         return np.where(unpaid, 0.0, paid)
 
     def observe_step(self, ended: Flags | None) -> None:
-        """See what a step left; ``ended`` as of `step_rewards`."""
+        """Observe the environments after a step; ``ended`` as for `step_rewards`."""
         batch, now = self._batch, self._batch.observations
         if ended is not None:
             last = np.where(ended[:, None], batch.final_observations, now)
@@ -185,7 +185,7 @@ class CustomFunctions:
             selected = _evaluate_observation(self._observation, self._batch.records(ended), self._batch.experiment)
             if selected.shape[1] != len(self._low):
                 raise ValueError(
-                    f"observation must give as many entries every time, but gave {len(self._low)} at first and "
+                    f"observation must always give the same number of entries, but gave {len(self._low)} at first and "
                     f"{selected.shape[1]} now; keep their number"
                 )
         return np.clip(selected, self._low, self._high).astype(np.float32)

@@ -1,8 +1,7 @@
-"""The environments as `gymnasium.Env`: one experiment, one input per step."""
+"""The single environment as `gymnasium.Env`: one experiment, one input per step."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -19,6 +18,7 @@ from duffing_env.env_base import (
     make_experiment,
     observation_space,
     refuse_concurrent_calls,
+    scalar_action,
 )
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
@@ -26,6 +26,7 @@ from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
 from estimator.models.named_parameters import Parameters
 from estimator.support.argument_checks import check_choice, short_repr, to_float_array
+from estimator.support.argument_checks import check_choice
 
 if TYPE_CHECKING:
     from duffing_env.rendering.episode_renderer import EpisodeRenderer
@@ -39,7 +40,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     ## Description
 
     An oscillator m x'' + c x' + a x + b x³ = u + w with unknown m, c, a, b is sampled every 1.6384 ms. At each step
-    the agent applies the input u_t, the plant moves from x_t to x_{t+1}, the sensor gives y_{t+1} = x_{t+1} + v, and
+    the agent applies the input u_t, the plant moves from x_t to x_{t+1}, the sensor measures y_{t+1} = x_{t+1} + v, and
     an online estimator updates its posterior over the coefficients (θ1, θ2, θ3, η) of the difference equation
 
         x_{t+1} = θ1 x_t + θ2 x_t³ + θ3 x_{t-1} + η u_t + w̃_t
@@ -70,14 +71,14 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     | 20 | time left, in parts of the horizon | 0 | 1 |
     | 21 | part of the input's energy budget that is left; 1 without a budget (``max_rms``) | 0 | 1 |
 
-    That is ``observation="posterior"``. ``"privileged"`` adds the true coefficients, as entries 0-3 show the means:
-    for training and for tests. ``"history"`` shows no belief, but the last ``history`` inputs and outputs, each step's
-    input before its outputs, the oldest first, as entries 18 and 19, and then entries 20 and 21. A function of the
-    beliefs shows what it gives (docs/extending.md).
+    This is ``observation="posterior"``. ``"privileged"`` appends the true coefficients, scaled as the means of entries
+    0-3, for training and tests. ``"history"`` shows no belief, but the last ``history`` inputs and outputs, scaled as
+    entries 18 and 19, the oldest first, each step's input before its outputs, and then entries 20 and 21. A function of
+    the beliefs shows its own values (docs/extending.md).
 
     ## Reward
 
-    By name (``reward=``), in nats but for the two errors; C is the posterior covariance of (θ, η), c* the truth.
+    By name (``reward=``), in nats except for the two errors; C is the posterior covariance of (θ, η), c* the truth.
 
     | Name | Reward of a step | Range |
     |------|------------------|-------|
@@ -89,9 +90,9 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
 
-    The ranges are those of an episode's sum. `duffing_env.rewards.reward_registry` (the manual's page "Rewards") says what each bounds,
-    and how it can be fooled. What is gained is kept when an episode is terminated, unless ``terminated_return`` is set;
-    with ``terminal`` it is paid in the last step, in one sum.
+    The ranges are for an episode's sum. `duffing_env.rewards.reward_registry` (the manual's page "Rewards") gives the
+    bounds and the weaknesses of each. A terminated episode keeps its gain unless ``terminated_return`` is set;
+    ``terminal`` pays the whole sum in the last step.
 
     ## Starting state
 
@@ -100,15 +101,15 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     of the coefficients of oscillators so drawn; γ and ξ are Gamma of shape 2 about the true noise precisions.
 
     With ``noise_range`` above 1 each noise's standard deviation is drawn log-uniformly about ``process_noise`` and
-    ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior stays about
-    the middle of the range or the guesses, and ``truth`` has ``process_noise`` and ``measurement_noise``, too.
+    ``measurement_noise``, over a range of that factor: 10 is a decade, from 1/√10 to √10 times. The prior stays at the
+    middle of the range or at the guesses, and ``truth`` includes ``process_noise`` and ``measurement_noise``.
 
-    An estimator alone hardly learns how the two noises share what an output shows. With ``noise_hypotheses`` above 1 (9
-    resolve it) it weighs as many ratios by their evidence, as `estimator.OnlineEstimator` does, each at three levels:
-    three updates a hypothesis and sample. Two numbers, such as (5, 5), are values of each noise, a factor of 3 apart,
-    in all combinations: for guesses of which each may be wrong by itself. Observation, ``belief``, information and the
-    rewards that look at the belief are then those of the mixture's mean and covariance; ``free_energy`` is the
-    mixture's own. It is for ``structured`` and one sensor.
+    A single filter hardly learns the ratio of the two noises. With ``noise_hypotheses`` above 1 the estimator weighs
+    that number of ratios by their evidence, as `estimator.OnlineEstimator` does, each at three levels, which takes
+    three updates for each ratio and sample; 9 ratios are enough. A pair such as (5, 5) gives the numbers of values of
+    each noise, a factor of 3 apart, in all combinations: for two guesses that may be wrong independently. Observation,
+    ``belief``, information and the rewards by the belief then use the mixture's mean and covariance; ``free_energy`` is
+    the free energy of the mixture. This needs ``structured`` and one sensor.
 
     ## Episode end
 
@@ -118,14 +119,14 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
 
     ## Information
 
-    ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples that an action is held
-    for, and ``diverged``; at a reset they are 0 and False. At any time, and after the end of an episode until the next
-    reset: ``env.unwrapped.belief`` (`estimator.Belief`) and ``env.unwrapped.truth`` (`estimator.Parameters`). A vector
-    environment tells both in the infos of the rows that finish.
+    ``information_gain`` and ``log_posterior_gain`` of the step [nats], summed over the samples of a held action, and
+    ``diverged``; at a reset they are 0 and False. ``env.unwrapped.belief`` (`estimator.Belief`) and
+    ``env.unwrapped.truth`` (`estimator.Parameters`) can be read at any time, also between the end of an episode and the
+    next reset. A vector environment puts both into the infos of the rows that finish.
 
-    ``reset(options={"truth": truth})`` begins with a system of choice: a dict or a `estimator.Parameters` of m, c, a
-    and b, and of the noises where they are drawn (without them they are drawn as ever). All other random numbers are
-    those that the seed gives without it.
+    ``reset(options={"truth": truth})`` starts with a chosen system: a dict or `estimator.Parameters` of m, c, a and b,
+    and of the noises where these are drawn (noises left out are drawn as usual). All other random numbers stay as the
+    seed gives them.
 
     ## Arguments
 
@@ -133,39 +134,39 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     |----------|---------|---------|
     | ``factorisation`` | ``structured`` | the estimator's: ``structured`` or ``mean_field`` |
     | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
-    | ``reward`` | ``information_gain`` | see above; or a function of one's own (`duffing_env.custom_functions`) |
-    | ``observation`` | ``posterior`` | or ``history``, ``privileged``, or a function of one's own |
+    | ``reward`` | ``information_gain`` | see above; or a function (`duffing_env.custom_functions`) |
+    | ``observation`` | ``posterior`` | or ``history``, ``privileged``, or a function |
     | ``history`` | 16 | steps that the observation ``history`` shows |
     | ``max_input`` | 0.15 | input limit [V] |
     | ``max_output`` | 0.6 | displacement limit [V] |
     | ``horizon`` | 256 | samples of an episode |
-    | ``hold`` | 1 | samples that an action is applied for; see above |
+    | ``hold`` | 1 | samples for which an action is applied; see below |
     | ``terminal`` | False | pay the episode's whole reward in its last step, and 0 before |
-    | ``terminated_return`` | None | return of an episode that is terminated, whatever it gained; None keeps that |
+    | ``terminated_return`` | None | return of a terminated episode, whatever it gained; None keeps the gain |
     | ``process_noise`` | 5e-4 | standard deviation of w̃ [V] |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V] |
     | ``spread`` | 0.3 | half width of the parameters' range, relative, in (0, 1) |
-    | ``noise_range`` | 1 | both noises are drawn for every episode; see above |
-    | ``process_noise_guess`` | None | where the prior of γ is centred [V]; None: at ``process_noise`` |
-    | ``measurement_noise_guess`` | None | where that of ξ is centred [V]; None: at ``measurement_noise`` |
+    | ``noise_range`` | 1 | factor over which both noises are drawn for every episode; see above |
+    | ``process_noise_guess`` | None | centre of the prior of γ [V]; None: ``process_noise`` |
+    | ``measurement_noise_guess`` | None | centre of the prior of ξ [V]; None: ``measurement_noise`` |
     | ``noise_shape`` | 2 | shape of these Gamma priors; 2 is weak |
-    | ``noise_hypotheses`` | 1 | ratios of the noises to weigh by their evidence; see above |
-    | ``plant_spread`` | ``spread`` | the same for the plant alone, not for its prior; 0: all are the twin |
-    | ``mean`` | None | parameter to the middle of its range, of some or all; the twin's where None |
-    | ``prior`` | None | a `estimator.Belief` to start from; None: the one that fits plants and noises |
+    | ``noise_hypotheses`` | 1 | number of noise ratios to weigh by their evidence; see above |
+    | ``plant_spread`` | ``spread`` | ``spread`` of the plants, if other than the prior's; 0: all are the twin |
+    | ``mean`` | None | name to the middle of its range, for some or all parameters; else the twin's |
+    | ``prior`` | None | an `estimator.Belief` to start from; None: the one that fits plants and noises |
     | ``max_rms`` | None | largest RMS input over a whole episode [V]; see `PowerEnv` |
     | ``max_slew`` | None | largest change of the input between samples [V]; a larger one is cut |
-    | ``input_cost`` | 0 | taken off the reward for every (u / ``max_input``)² |
+    | ``input_cost`` | 0 | cost of (u / ``max_input``)² in every sample, taken off the reward |
     | ``jump``, ``drift`` | 0 | a mass that jumps, an estimator that expects change; see `DriftEnv` |
-    | ``branch`` | ``train`` | of the seeds: ``train``, ``validation`` or ``test``; see below |
+    | ``branch`` | ``train`` | branch of the seeds: ``train``, ``validation`` or ``test``; see below |
     | ``render_mode`` | None | ``rgb_array`` (needs no display) or ``human`` |
 
-    The same seed gives other oscillators and other noise in each ``branch`` of the seeds. What is trained in ``train``,
-    with whatever seed, never met a system of ``test``, on which `evaluate.py` compares.
+    The same seed gives other oscillators and other noise in each ``branch``. An agent trained in ``train``, with any
+    seed, has never met a system of ``test``, on which `evaluate.py` compares.
 
-    With ``hold`` a step is that many samples with the same action, to the bit: its reward is the sum of theirs, limits
-    hold for every sample, and an episode may end within. ``horizon`` stays in samples, so an episode has
-    ceil(horizon / hold) steps, and the last may be shorter; the observation is that of the last sample.
+    With ``hold`` a step equals that number of steps with the same action, to the bit: its reward is the sum of their
+    rewards, limits apply to every sample, and an episode may end within the step. ``horizon`` counts samples, so an
+    episode has ceil(horizon / hold) steps, and the last may be shorter; a step returns its last sample's observation.
 
     >>> import gymnasium as gym
     >>> import duffing_env
@@ -216,7 +217,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
 
     @property
     def truth(self) -> Parameters:
-        """The oscillator that is to be identified.
+        """The true parameters of the oscillator.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, which draws it.
@@ -232,11 +233,11 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         """Draw an oscillator and start an episode.
 
         Args:
-            seed: of oscillator and noise; without it the random numbers go on.
-            options: may hold ``truth``, a system of choice.
+            seed: seed of oscillator and noise; without it the stream of random numbers continues.
+            options: may hold ``truth``, a chosen system.
 
         Raises:
-            ValueError: for another option, or what is no such system; nothing has changed then.
+            ValueError: for another option or an invalid system; nothing has changed then.
         """
         options = check_reset_options(options, *self._reset_options)
         chosen_truth = self._batch.parse_truth(options["truth"]) if "truth" in options else None
@@ -266,7 +267,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        clipped_action, custom = _scalar_action(action), self._custom
+        clipped_action, custom = scalar_action(action), self._custom
         if custom is not None:
             custom.before_step()
         outcome = self._play_action(clipped_action)
@@ -282,9 +283,9 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         return observation
 
     def _reset_plant(self) -> None:
-        """What else has to come to rest before an episode: nothing that is simulated."""
+        """Bring an external plant to rest before an episode; simulated plants need nothing."""
 
-    #: Options of a reset.
+    #: Names of the options of a reset.
     _reset_options: ClassVar[tuple[str, ...]] = ("truth",)
     _info_gains: ClassVar[tuple[str, ...]] = ("information_gain", "log_posterior_gain")
     _info_flags: ClassVar[tuple[str, ...]] = ("diverged",)
@@ -296,7 +297,8 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         return info
 
     def _play_action(self, action: float) -> dict[str, float]:
-        """Let as many samples pass as the action holds: sums of what they earned, and how the last one left it."""
+        """Hold the action for its samples; return the sums of their rewards and gains, and the last one's flags."""
+        # The kernel can hold an action as well; here each sample is a call, as it is drawn or given to a real plant.
         outcome = self._play_sample(action)
         for _ in range(1, self.experiment.hold):
             if outcome["terminated"] or outcome["truncated"]:
@@ -313,11 +315,11 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         return self._batch.outcome(0)
 
     def _apply_sample(self, action: float) -> None:
-        """Let one sample pass; the action is in [-1, 1]."""
+        """Step one sample; the action is in [-1, 1]."""
         self._batch.step(action)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """Input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
+        """Draw input, output and posterior so far: an RGB array (height, width, 3) in mode ``rgb_array``."""
         if self.render_mode is None or self._renderer is None:
             gym.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array', and reset it")
             return None
@@ -341,16 +343,3 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-def _scalar_action(action: npt.ArrayLike) -> float:
-    try:
-        given = action if type(action) is np.ndarray else to_float_array("action", action)
-        item = given.item() if given.size == 1 else math.nan
-        value = math.nan if isinstance(item, str | bytes) else float(item)  # float() reads text, too
-    except (TypeError, ValueError, OverflowError):
-        value = math.nan
-    if not math.isfinite(value):
-        remedy = "; pass action.detach()" if getattr(action, "requires_grad", False) else ""
-        raise ValueError(f"action must be one finite number in [-1, 1], but is {short_repr(action)}{remedy}")
-    return min(max(value, -1.0), 1.0)

@@ -1,7 +1,8 @@
-"""What single and vector environments share: spaces, options, specification, and that one call goes at a time."""
+"""The base of single and vector environments: spaces, options, Gymnasium specification, and exclusive calls."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import fields
@@ -18,25 +19,47 @@ from gymnasium.vector import AutoresetMode
 from duffing_env.batch import Batch
 from duffing_env.custom_functions import CustomFunctions, experiment_observation_bounds
 from duffing_env.experiment_config import Experiment
-from estimator.support.argument_checks import did_you_mean, short_repr
+from estimator.support.argument_checks import did_you_mean, short_repr, to_float_array
 from estimator.support.array_types import FloatArray
 
 MethodType = TypeVar("MethodType", bound=Callable[..., Any])
 
 
 def observation_space(experiment: Experiment) -> spaces.Box:
-    """The observation's space: a flat float32 Box with finite bounds."""
+    """The observation space: a flat float32 Box with finite bounds."""
     low, high = experiment_observation_bounds(experiment).T.astype(np.float32)
     return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
 
 
 def action_space() -> spaces.Box:
-    """The action's space: the input in parts of the largest."""
+    """The action space: the input in parts of the largest."""
     return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 
+def scalar_action(action: npt.ArrayLike) -> float:
+    """The action as one number, clipped to [-1, 1].
+
+    Raises:
+        ValueError: for an action that is not one finite number.
+    """
+    try:
+        given = action if type(action) is np.ndarray else to_float_array("action", action)
+        item = given.item() if given.size == 1 else math.nan
+        value = math.nan if isinstance(item, str | bytes) else float(item)  # float() reads text, too
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if not math.isfinite(value):
+        remedy = "; pass action.detach()" if getattr(action, "requires_grad", False) else ""
+        raise ValueError(f"action must be one finite number in [-1, 1], but is {short_repr(action)}{remedy}")
+    return min(max(value, -1.0), 1.0)
+
+
 def check_reset_options(options: dict[str, Any] | None, *allowed: str) -> dict[str, Any]:
-    """The options of a reset; ValueError for one that is not known, or what is not a dict."""
+    """The options of a reset as a dict.
+
+    Raises:
+        ValueError: for options that are no dict, or an unknown one.
+    """
     if not isinstance(options, dict | None):
         raise ValueError(f"options of reset must be a dict or None, but are {options!r:.200}")
     for name in options or {}:
@@ -46,15 +69,15 @@ def check_reset_options(options: dict[str, Any] | None, *allowed: str) -> dict[s
 
 
 class _DefaultEpisodeSteps(int):
-    """Steps of an episode by the environment's own horizon, and not by a limit that somebody asked for."""
+    """Steps of an episode by the environment's horizon, in contrast to a limit from the user."""
 
 
 class TrackSpec(EnvSpec):
-    """A specification that says after how many steps an episode ends, which wrappers ask for.
+    """A specification with the number of steps of an episode, which wrappers read.
 
-    That number follows from the options, and an environment made from the specification may be given others. So it is
-    no limit: `gymnasium.make` and `make_vec`, which would cut a longer ``horizon`` short by it, find None, and JSON has
-    None. A limit that was asked for (``max_episode_steps=9``) stays one.
+    The number follows from the options, and an environment made from the specification may get other options. So it is
+    no limit: `gymnasium.make` and `make_vec`, which would truncate a longer ``horizon`` by it, read None, as does JSON.
+    A limit from the user (``max_episode_steps=9``) stays a limit.
     """
 
     @property
@@ -72,7 +95,7 @@ class TrackSpec(EnvSpec):
         self.__dict__["max_episode_steps"] = steps
 
     def to_json(self) -> str:
-        """As `gymnasium.envs.registration.EnvSpec`, which reads it again."""
+        """JSON that `gymnasium.envs.registration.EnvSpec.from_json` reads again."""
         spec_fields = {field.name: getattr(self, field.name) for field in fields(EnvSpec) if field.init}
         if isinstance(spec_fields["max_episode_steps"], _DefaultEpisodeSteps):
             spec_fields["max_episode_steps"] = None
@@ -80,11 +103,11 @@ class TrackSpec(EnvSpec):
 
 
 class ReadOnlyOption:
-    """An attribute of an environment that can be read, but not set, because nothing would follow from it.
+    """A read-only attribute of an environment: setting an option of a made environment would have no effect.
 
     Args:
-        name: of the attribute, and of the argument that it was made with.
-        attribute_path: where it is read, from the environment on.
+        name: name of the attribute and of the argument.
+        attribute_path: path to the value from the environment, with dots.
     """
 
     def __init__(self, name: str, attribute_path: str) -> None:
@@ -96,23 +119,23 @@ class ReadOnlyOption:
         return env.__dict__[self._name] if self._name in env.__dict__ else self._read(env)
 
     def __set__(self, env: Any, value: Any) -> None:
-        if not hasattr(env, self._name):  # an option of other environments, which this one has not
+        if not hasattr(env, self._name):  # an option of other environments only
             env.__dict__[self._name] = value
             return
         raise AttributeError(
-            f"{self._name} cannot be set to {short_repr(value)} in an environment that is made already; make a new one with "
-            f"{self._name}=..., or choose the system of an episode with reset(options={{'truth': ...}})"
+            f"{self._name} cannot be set to {short_repr(value)} in an environment that is made already; make a new one "
+            f"with {self._name}=..., or choose the system of an episode with reset(options={{'truth': ...}})"
         )
 
 
 class ExperimentEnv:
-    """What an environment, single or vector, tells of its experiment and beliefs, and its specification.
+    """Base of single and vector environments: options, beliefs and specification.
 
-    Its options are attributes that can be read. Whoever sets one, by `setattr`, ``set_wrapper_attr`` or ``set_attr``,
-    gets an AttributeError: an experiment is what it was made as.
+    The options are read-only attributes. Setting one, by `setattr`, ``set_wrapper_attr`` or ``set_attr``, raises an
+    AttributeError: an experiment keeps the options that it was made with.
 
-    The specification tells Gymnasium's wrappers after how many steps an episode ends (`TrackSpec`). That is no part of
-    what is registered, because Gymnasium would then cut a longer ``horizon`` short.
+    The specification gives Gymnasium's wrappers the number of steps of an episode (`TrackSpec`). The registration does
+    not contain it, because Gymnasium would then truncate a longer ``horizon``.
     """
 
     experiment: Experiment
@@ -128,7 +151,7 @@ class ExperimentEnv:
 
     @classmethod
     def _experiment_class(cls) -> type[Experiment]:
-        """The experiments whose options are those of the environment."""
+        """The class of experiments whose fields are the environment's options."""
         raise NotImplementedError
 
     @property
@@ -137,12 +160,12 @@ class ExperimentEnv:
         return self._batch.records()
 
     def mixture(self, index: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Records (m, size) and weights (m,) of the beliefs that one weighs: one, or one for each hypothesis."""
+        """Records (m, size) and weights (m,) of environment ``index``: one belief, or one for each noise hypothesis."""
         return self._batch.mixture(index)
 
     @property
     def _observation_owner(self) -> Batch | CustomFunctions:
-        """What has the observations."""
+        """The object that holds the observations."""
         return self._batch if self._custom is None else self._custom
 
     @property
@@ -153,26 +176,26 @@ class ExperimentEnv:
     #: Input of the action 1 [V].
     max_input: Any = ReadOnlyOption("max_input", "experiment.max_input")
 
-    #: Samples of an episode that no limit ends.
+    #: Samples of an episode without an early end.
     horizon: Any = ReadOnlyOption("horizon", "experiment.samples")
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What the environment was made from."""
+        """The specification that the environment was made from."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None:
             spec_fields = {field.name: getattr(spec, field.name) for field in fields(EnvSpec) if field.init}
-            # As JSON can hold it.
+            # Values that JSON can hold.
             modes = {name: mode.value for name, mode in spec.kwargs.items() if isinstance(mode, AutoresetMode)}
             spec_fields["kwargs"] = {**spec.kwargs, **modes}
             if spec_fields["max_episode_steps"] is None or isinstance(
                 spec_fields["max_episode_steps"], _DefaultEpisodeSteps
             ):
                 steps, limit = -(-self.experiment.samples // self.experiment.hold), spec.kwargs.get("max_episode_steps")
-                # A vector environment has the limit that was asked for among its options.
+                # A vector environment has the user's limit among its options.
                 spec_fields["max_episode_steps"] = _DefaultEpisodeSteps(
                     min(steps, limit) if limit and limit > 0 else steps
                 )
@@ -181,14 +204,14 @@ class ExperimentEnv:
 
 
 class UnknownOption(TypeError, ValueError):
-    """A keyword that is no option: in the words of Python's own TypeError, which some trainers look for."""
+    """An unknown option, in the words of Python's TypeError, which some trainers catch."""
 
 
 def make_experiment(experiment_class: type[Experiment], options: dict[str, Any]) -> Experiment:
     """An experiment from keyword arguments.
 
     Raises:
-        UnknownOption: for an unknown one, with the nearest known.
+        UnknownOption: for an unknown option, with the nearest known one.
     """
     option_names = [field.name for field in fields(experiment_class)]
     for name in options:
@@ -201,10 +224,10 @@ def make_experiment(experiment_class: type[Experiment], options: dict[str, Any])
 
 
 def refuse_concurrent_calls(method: MethodType) -> MethodType:
-    """Refuse a call of a method while another call that is in turn has not returned; nothing has changed then.
+    """Refuse a call of the method before the last call of such a method has returned; nothing has changed then.
 
-    Two threads that step at once would mix two steps into one. The object has a list ``_call_token`` of one entry, which a
-    call takes out and puts back: a lock that can be copied.
+    Two threads that step at once would mix two steps into one. The object has a list ``_call_token`` of one entry: a
+    call takes it out and puts it back, a lock that can be copied.
 
     Raises:
         RuntimeError: for the second call.

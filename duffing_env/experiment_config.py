@@ -1,7 +1,6 @@
-"""What is fixed about an experiment: limits, noises, priors, the estimator and the reward.
+"""The options of an experiment: limits, noises, priors, the estimator and the reward.
 
-The fields of these classes are the keyword arguments of `gymnasium.make`; all but functions and beliefs of one's own
-are JSON-able.
+The fields of these classes are the keyword arguments of `gymnasium.make`; JSON can hold all but functions and beliefs.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ from estimator.support.argument_checks import (
 )
 from estimator.support.array_types import FloatArray
 
-#: More ratios of the noises, or values of each, than are worth their time.
+#: Largest number of noise ratios, or of values of each noise: more are not worth their time.
 MAX_HYPOTHESES = 99
 
-#: Samples of an episode, or of an action, at most.
+#: Largest number of samples of an episode, or of an action.
 MAX_SAMPLES = 10**9
 
-#: Smallest and largest relative half width of a range of parameters.
+#: Smallest and largest relative half width of a parameter's range.
 SPREAD_LIMITS = 1e-6, 0.999
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What all experiments have; `duffing_env.env.DuffingEnv` says what its options are."""
+    """The options of all experiments; `duffing_env.env.DuffingEnv` describes them."""
 
     factorisation: str = "structured"
     iterations: int | None = None
@@ -66,7 +65,7 @@ class Experiment:
 
     #: Whether there is a true plant to compare with.
     knows_truth: ClassVar[bool] = True
-    #: Whether hypotheses about the noises are moved by sigma points: from a wide belief, or where a model bends.
+    #: Whether sigma points propagate the beliefs of several noise hypotheses: for wide beliefs and nonlinear models.
     uses_cubature: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -76,9 +75,9 @@ class Experiment:
             check_integer("iterations", self.iterations, MAX_ITERATIONS)
         check_reward(self.reward)
         if callable(self.reward) and (self.terminal or self.terminated_return is not None):
-            raise ValueError("terminal and terminated_return must be left out with a reward of one's own")
+            raise ValueError("terminal and terminated_return must be left out where reward is a function")
         check_observation(self.observation, self.history)
-        for name in ("max_input", "max_output"):  # what is far beyond lets an oscillator run away, and its episode end
+        for name in ("max_input", "max_output"):  # a larger limit lets an oscillator diverge, and its episode end
             check_number(name, getattr(self, name), maximum=1e300)
         check_integer("hold", self.hold, MAX_SAMPLES)
         check_bool("terminal", self.terminal)
@@ -91,12 +90,12 @@ class Experiment:
 
     @property
     def samples(self) -> int:
-        """Samples of an episode that no limit ends."""
+        """Samples of an episode without an early end."""
         raise NotImplementedError
 
     @property
     def model(self) -> Model:
-        """The model that is believed."""
+        """The model of the belief."""
         return difference()
 
     @property
@@ -106,12 +105,12 @@ class Experiment:
 
     @property
     def truth_model(self) -> Model:
-        """The model whose parameters the truth has."""
+        """The model with the true parameters."""
         return self.plant or self.model
 
     @property
     def degree(self) -> int:
-        """Of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one."""
+        """Degree of the input over a sample of a differential equation: 0 held, 1 linear from the last input on."""
         return 0
 
     @property
@@ -121,7 +120,7 @@ class Experiment:
 
     @property
     def scales(self) -> Scales:
-        """What one inside is worth outside."""
+        """Factors from internal to physical units."""
         return Scales(self.step)
 
     @property
@@ -131,23 +130,23 @@ class Experiment:
 
     @property
     def nominal_parameters(self) -> dict[str, float]:
-        """The plant in the middle of the range: the Silverbox circuit's as a model of it sees it, 1 of other models."""
+        """The plant in the middle of the range: the twin of the Silverbox circuit; 1 for parameters of other models."""
         twin = SILVERBOX_ODE_TWIN if self.truth_model.is_continuous else SILVERBOX_TWIN
         return {name: twin.get(name, 1.0) for name in parameter_names(self.truth_model)}
 
     @property
     def replayed_record(self) -> tuple[FloatArray, FloatArray]:
-        """Recorded input and output; of one sample each where the plant is simulated."""
+        """Recorded input and output; one sample of each where the plant is simulated."""
         return np.zeros(1), np.zeros(1)
 
     @property
     def plant_params(self) -> dict[str, Any]:
-        """Fields of `KernelParams` that describe the plant."""
+        """The fields of `KernelParams` that describe the plant."""
         return {}
 
     @property
     def likeliest_log_noise_ratio(self) -> float | None:
-        """Where hypotheses about the noises are likeliest at first (`estimator.inference.noise_grid.initial_weights`)."""
+        """The likeliest noise ratio before data, as a logarithm (`estimator.inference.noise_grid.initial_weights`)."""
         return None
 
     @property
@@ -156,7 +155,7 @@ class Experiment:
 
     @property
     def kernel_spec(self) -> KernelSpec:
-        """What the kernel is compiled for."""
+        """The kind of the experiment, which the kernel is compiled for."""
         return KernelSpec(
             self.model, self.plant, self.degree, self.factorisation,
             self._n_iterations if self.factorisation == "structured" else 0,
@@ -166,7 +165,7 @@ class Experiment:
 
     @property
     def kernel_params(self) -> KernelParams:
-        """The experiment as the kernel is told of it."""
+        """The run-time parameters of the kernel."""
         prior, model, names = self.prior_belief, self.model, parameter_names(self.truth_model)
         first_record, plant_fields = prior.record, dict(self.plant_params)
         if self.noise_hypotheses != 1:
@@ -200,7 +199,7 @@ class Experiment:
 class SimulatedExperiment(Experiment):
     """An experiment on the plant ``difference``, with a new oscillator in every episode.
 
-    `duffing_env.env.DuffingEnv` says what its options are.
+    `duffing_env.env.DuffingEnv` describes its options.
     """
 
     horizon: int = 256
@@ -238,7 +237,7 @@ class SimulatedExperiment(Experiment):
         if self.prior is not None:
             check_prior(self.prior, self.scales, self.model)
         if self.drift and self.factorisation == "mean_field":
-            raise ValueError(f"drift must be 0 in mean field, which cannot follow, but is {self.drift!r}")
+            raise ValueError(f"drift must be 0 in mean field, which cannot track changes, but is {self.drift!r}")
 
     @property
     def samples(self) -> int:
@@ -252,33 +251,33 @@ class SimulatedExperiment(Experiment):
 
     @property
     def nominal_parameters(self) -> dict[str, float]:
-        """The twin, or the means of one's own."""
+        """The twin, with the option ``mean`` in its place where given."""
         return super().nominal_parameters | {name: float(value) for name, value in (self.mean or {}).items()}
 
     @cached_property
     def prior_belief(self) -> Belief:
-        """The prior of one's own, or the one that fits plants so drawn, and the noises."""
+        """The option ``prior``, or the prior that fits the range of the plants and the noises."""
         if self.prior is not None:
             return self.prior.with_factorisation(self.factorisation)
         return self.prior_for_model(self.model, self.factorisation)
 
     def prior_for_model(self, model: Model, factorisation: str = "structured") -> Belief:
-        """The prior of any model of plants so drawn: of the plant's own, or of another that knows its parameters."""
+        """The prior that fits the range of the plants, for any model with the plant's parameters."""
         noises = *self.prior_noise_stds, self.noise_shape
         return weak_prior(model, *self.coefficient_moments(model), *noises, scales=self.scales).with_factorisation(
             factorisation
         )
 
     def coefficient_moments(self, model: Model) -> tuple[FloatArray, FloatArray]:
-        """Mean (K,) and covariance (K, K) of the coefficients of plants so drawn."""
+        """Mean (K,) and covariance (K, K) of the coefficients over the range of the plants."""
         for name, value in self.nominal_parameters.items():
             if value == 0:
-                raise ValueError(f"mean[{name!r}] must not be 0, for it is known up to a factor; give a prior as well")
+                raise ValueError(f"mean[{name!r}] must not be 0, as its range is relative; give a prior as well")
         return log_uniform_moments(model, self.nominal_parameters, self.spread, self.scales)
 
     @property
     def prior_noise_stds(self) -> tuple[float, float]:
-        """Standard deviations at which the priors of γ and of the first sensor's ξ are centred."""
+        """Standard deviations at the centres of the priors of γ and of the first sensor's ξ."""
         process, sensor = self.process_noise_guess, self.measurement_noise_guess
         return (
             float(self.process_noise if process is None else process),
@@ -303,7 +302,11 @@ class SimulatedExperiment(Experiment):
 
 
 def check_nominal_parameters(means: Mapping[str, float] | None, names: Sequence[str]) -> None:
-    """Refuse middles of the parameters' ranges that are not such, of some or all of them."""
+    """Refuse unknown parameters, and values that cannot be the middle of a parameter's range.
+
+    Raises:
+        ValueError: with the parameter and its value.
+    """
     if means is None:
         return
     if not isinstance(means, Mapping) or not set(means) <= set(names):
@@ -313,7 +316,11 @@ def check_nominal_parameters(means: Mapping[str, float] | None, names: Sequence[
 
 
 def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
-    """Refuse what is not a belief, or one in other scales, or of another model where that is given."""
+    """Refuse a prior that is no belief, has other scales, or is of another model than ``model``, if that is given.
+
+    Raises:
+        ValueError: with the differences and the remedy.
+    """
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be an estimator.Belief or None, but is {short_repr(prior)}")
     if prior.scales != scales:
@@ -325,8 +332,8 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
             if required != found
         )
         raise ValueError(
-            f"prior must have the rig's scales, limit and range, but has {differences}; identify once more with the rig as "
-            f"it is now, and save that"
+            f"prior must have the rig's scales, limit and range, but has {differences}; identify once more with the "
+            f"present rig, and save that belief"
         )
     if model is not None and prior.model != model:
         raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

@@ -1,4 +1,4 @@
-"""The environments as `gymnasium.vector.VectorEnv`: many experiments, stepped inside one compiled call."""
+"""The vector environment as `gymnasium.vector.VectorEnv`: many experiments, stepped by one compiled call."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ _RESET_MODES = {
     AutoresetMode.SAME_STEP: RESET_SAME_STEP,
 }
 
-#: Name of what a step leaves to its place in a batch's outcomes; the flags are the last of them.
+#: Name of an outcome of a step to its row in a batch's outcomes; the flags come last.
 _OUTCOME_INDEX = {name.lower(): place for place, name in enumerate(OUTCOME_ROWS)}
 _FIRST_FLAG = _OUTCOME_INDEX["terminated"]
 
-#: Rows at most, some gigabytes of them.
+#: Largest number of rows, which take some gigabytes.
 MAX_ENVS = 2**20
 
-#: Numbers that all observations have together: 1 GiB.
+#: Largest number of observed numbers in all rows together: 1 GiB.
 _MAX_OBSERVED_NUMBERS = 2**28
 
 Observations = npt.NDArray[np.float32]
@@ -58,25 +58,24 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
     """Many `DuffingEnv` at once: the same numbers, row by row.
 
     Row i, reset with seed s, follows a single environment that is reset with ``spawn_seeds(s, num_envs)[i]``, bit for
-    bit, whatever the number of rows and threads. A row's random numbers go on over its episodes; autoreset does not
+    bit, whatever the number of rows and threads. A row's random stream continues over its episodes; autoreset does not
     seed it anew. Rows that are being reset are neither integrated nor inferred.
 
     Args:
         num_envs: number of rows.
-        max_episode_steps: cuts episodes off after so many steps, as `gymnasium.wrappers.TimeLimit` does, which
-            `gymnasium.make` puts around a single environment; None or -1: nothing does but the ``horizon``.
+        max_episode_steps: number of steps after which an episode is truncated, as by `gymnasium.wrappers.TimeLimit`,
+            which `gymnasium.make` puts around a single environment; None or -1: the ``horizon`` alone truncates.
         autoreset_mode: when a finished row starts its next episode: in the step after (``NEXT_STEP``, the default),
-            in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended
-            with), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
-        copy: give out observations that stay as they are; without it the next step overwrites them.
-        threads: threads that step the rows, at most Numba's; results do not depend on it.
-        render_mode: None; render a single environment to look at one.
-        options: those of the single environment.
+            in the same step (``SAME_STEP``: ``info["final_obs"]`` and ``info["final_info"]`` hold the end of the
+            last), or by ``reset(options={"reset_mask": mask})`` (``DISABLED``).
+        copy: whether returned observations stay as they are; without it the next step overwrites them.
+        threads: number of threads that step the rows, at most Numba's; results do not depend on it.
+        render_mode: None; only a single environment can be rendered.
+        options: options of the single environment.
 
-    Infos are arrays with masks under ``_key``, as `gymnasium.vector.SyncVectorEnv` makes them of single environments:
-    of every step and reset ``information_gain`` and ``log_posterior_gain`` [nats] and the flags. A row that finishes
-    also has the ``belief`` and the ``truth`` it ended with. Under ``SAME_STEP`` its last step is told in
-    ``final_info``.
+    Infos are arrays with masks under ``_key``, as `gymnasium.vector.SyncVectorEnv` makes them from single environments:
+    ``information_gain`` and ``log_posterior_gain`` [nats] and the flags of every step and reset. A row that finishes
+    also has its last ``belief`` and ``truth``. Under ``SAME_STEP`` the infos of its last step are in ``final_info``.
 
     >>> import gymnasium as gym
     >>> envs = gym.make_vec("duffing_env/Amplitude-v0", num_envs=4, vectorization_mode="vector_entry_point")
@@ -134,8 +133,8 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         )
         if num_envs * n_hypotheses > MAX_ENVS or num_envs * n_observed > _MAX_OBSERVED_NUMBERS:
             raise ValueError(
-                f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each of {num_envs} "
-                f"environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
+                f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each of "
+                f"{num_envs} environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
             )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -154,7 +153,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
 
     @property
     def truth(self) -> Parameters:
-        """The oscillators that are to be identified, a batch of ``num_envs``.
+        """The true parameters of the oscillators, a batch of ``num_envs``.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, which draws them.
@@ -171,17 +170,17 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start episodes in all rows, or in those of ``options["reset_mask"]`` (num_envs,).
+        """Start episodes in all rows, or where ``options["reset_mask"]`` (num_envs,) is true.
 
         Args:
-            seed: of the batch, from which `spawn_seeds` makes the rows'; or one seed for each row. The random numbers
-                of rows that get none go on; at first they come from the operating system.
-            options: may hold ``reset_mask``, and ``truth``, systems of choice for this episode of the rows: as of the
-                single environment, each entry a number or (num_envs,) numbers; or a list of num_envs of them, one for
+            seed: seed of the batch, from which `spawn_seeds` makes the seeds of the rows; or one seed for each row. In
+                rows without a seed the stream of random numbers continues; the first comes from the operating system.
+            options: may hold ``reset_mask``, and ``truth``, chosen systems for this episode of the rows: as in the
+                single environment, each entry a number or (num_envs,) numbers; or a list of num_envs systems, one for
                 each row, with None for a row whose system is drawn.
 
         Raises:
-            ValueError: for another option, a mask or a truth that is not one, or another number of seeds.
+            ValueError: for another option, an invalid mask or truth, or a wrong number of seeds.
         """
         options = check_reset_options(options, "reset_mask", "truth")
         mask = self._reset_mask(options)
@@ -247,10 +246,10 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
 
     @property
     def memory(self) -> dict[str, npt.NDArray[Any]]:
-        """All that the next step goes on from, by name: the arrays themselves, until the next step or reset.
+        """The state from which the next step continues, by name: the arrays themselves, until the next step or reset.
 
-        Episodes that went on in the one of two environments with the same options go on in the other when it is reset,
-        and its arrays are filled with copies of these.
+        To continue its episodes in another environment with the same options, reset that one and copy these arrays into
+        its own.
         """
         return self._batch.memory | ({} if self._custom is None else self._custom.memory)
 
@@ -261,12 +260,13 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
         if not (fits and mask.any()):
             raise ValueError(
-                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is {short_repr(mask)}"
+                f"reset_mask must be a bool array of shape {(self.num_envs,)} with a true entry, but is "
+                f"{short_repr(mask)}"
             )
         return mask
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: Flags) -> None:
-        """Start the rows' streams of random numbers, each from an ``np_random`` of its own."""
+        """Start the rows' streams of random numbers, each from its own ``np_random``."""
         seeds: Sequence[int | None] = [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             check_integer("seed", seed, MAX_SEED, 0)
@@ -276,12 +276,13 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
             seeds = list(seed) if is_list and getattr(seed, "shape", None) != () else []
             if len(seeds) != self.num_envs:
                 raise ValueError(
-                    f"seed must be a whole number or {self.num_envs} of them, one for each row, but is {short_repr(seed)}"
+                    f"seed must be a whole number or {self.num_envs} of them, one for each row, but is "
+                    f"{short_repr(seed)}"
                 )
             for row, each in enumerate(seeds):
                 if each is not None:
                     check_integer(f"seed[{row}]", each, MAX_SEED, 0)
-        # All that can fail has been done.
+        # Nothing below can fail.
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))
         for row in np.flatnonzero(mask).tolist():
@@ -292,7 +293,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         self._seeded |= mask
 
     def _infos(self, outcomes: FloatArray, flags: npt.NDArray[np.bool_], finished: Flags | None) -> dict[str, Any]:
-        """What is told of a step, and of the rows that finished in it, if any."""
+        """The infos of a step, and of the rows that finished in it, if any."""
         infos = self._step_infos(outcomes, flags, self._all_rows)
         if finished is None:
             return infos
@@ -321,11 +322,11 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         return infos
 
     def _final_beliefs_and_truths(self, finished: Flags) -> dict[str, Any]:
-        """What the finished rows ended with."""
+        """The last beliefs and truths of the finished rows."""
         same_step = self._autoreset_mode == AutoresetMode.SAME_STEP
         beliefs, truths = np.full((2, self.num_envs), None, dtype=object)
         rows = np.flatnonzero(finished)
         beliefs[rows] = self._batch.beliefs(rows, final=same_step)
-        # One by one: NumPy would take what has a length for a row of its own.
+        # One by one: NumPy would take an object that has a length for a row.
         truths[rows] = np.fromiter(self._batch.truths(rows, final=same_step), dtype=object, count=len(rows))
         return {"belief": beliefs, "_belief": finished.copy(), "truth": truths, "_truth": finished.copy()}

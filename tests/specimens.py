@@ -1,8 +1,8 @@
-"""One model and one environment of every sort. A kernel takes seconds to compile: tests use those of these.
+"""One model and one environment of every kind, shared by the tests because a kernel takes seconds to compile.
 
-Every environment of the list is another combination of what is compiled in (`duffing_env.storage.kernel_spec.KernelSpec`), but for the
-last ones, which share the first's and differ in what a kernel is told. Episodes are short, so that random actions
-end some at the limit and some at the horizon.
+Every environment of the list has another `duffing_env.storage.kernel_spec.KernelSpec`, except for the last ones, which
+share the first one's and differ in run-time parameters. Episodes are short, so that random actions end some at the
+limit and some at the horizon.
 """
 
 from collections.abc import Callable
@@ -120,7 +120,7 @@ def on_the_record(envs, actions):
 
 
 class OnTheRecord(SilverboxReplayEnv):
-    """Stays on the record, for whoever acts at random."""
+    """Replaces random actions by the record's inputs."""
 
     def step(self, action):
         return super().step(on_the_record(self, action))
@@ -227,7 +227,7 @@ COMPILED = [
     }),
 ]  # fmt: skip
 
-#: What the first's kernel is told.
+#: Environments with the first one's kernel and other run-time parameters.
 ENVIRONMENTS = [
     *COMPILED,
     difference_env(

@@ -1,10 +1,10 @@
-"""``make compat``: what other libraries make of the environments as they are, as a table.
+"""``make compat``: a table of which reinforcement learning libraries run the environments unchanged.
 
-Each library runs in a process of its own. A cell is ``yes`` where all that stands in its function has run, ``-`` where
-a library has no such thing, and the first line of the error elsewhere.
+Each library runs in a process of its own. A cell is ``yes`` where its function ran to the end, ``-`` where the library
+has no such feature, and the first line of the error elsewhere.
 
-- single: an environment by its id, checked by the library's own checker where it has one, and an episode.
-- vector: many environments at once: ours where the library takes a vector environment, its own over single ones else.
-- train: three iterations of the library's own PPO, or of what its loop is made of.
-- infos: what the environment tells of a step arrives in what the library collects.
+- single: an environment by its id, checked by the library's checker where there is one, and an episode.
+- vector: many environments at once: our vector environment where the library takes one, else the library's.
+- train: three iterations of the library's PPO, or of the parts of its loop.
+- infos: the infos of a step arrive in the data that the library collects.
 """

@@ -1,4 +1,4 @@
-"""The libraries, each with a function for each cell of its row."""
+"""The rows of the compatibility table: a library each, with a function for each cell."""
 
 import gymnasium as gym
 import numpy as np

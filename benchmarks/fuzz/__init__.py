@@ -1,1 +1,1 @@
-"""Bad inputs by the thousand: ``python -m benchmarks.fuzz``. What it finds, and the last table: docs/reliability.md."""
+"""Fuzzing with thousands of bad inputs: ``python -m benchmarks.fuzz``; docs/reliability.md has the last table."""

@@ -1,10 +1,10 @@
-"""Try bad inputs, and count what comes of them.
+"""Fuzzing: try bad inputs in every area, and count results, clear errors and faults.
 
 $ python -m benchmarks.fuzz --inputs 50000
 $ python -m benchmarks.fuzz --inputs 500 --areas files commands --seed 7
 
-Each area runs in a process of its own, so that one that dies is counted, and does not end the others. The exit status
-is 1 where there was a fault. The same seed and number give the same inputs.
+Each area runs in a process of its own: a process that dies is counted and does not end the others. The exit status is 1
+after a fault. The same seed and number give the same inputs.
 """
 
 import importlib
@@ -99,7 +99,7 @@ def inside(area: str, inputs: int, seed: int, path: Path | None) -> None:
 
 
 def _in_process(area: str, inputs: int, seed: int) -> dict[str, Any]:
-    """What an area's process counted; a crash where it did not live to tell."""
+    """The counts of an area's process; a crash where the process died."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tally.json"
         words = ["--inside", "--areas", area, "--inputs", str(max(1, inputs)), "--seed", str(seed), "--json", str(path)]

@@ -1,4 +1,4 @@
-"""What a caller may pass in by mistake: values of all kinds, and files with something changed."""
+"""Hypothesis strategies of bad arguments: values of all kinds, and files with a change."""
 
 from decimal import Decimal
 from fractions import Fraction

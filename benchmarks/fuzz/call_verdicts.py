@@ -1,4 +1,4 @@
-"""Calls, and what comes of them: a result, a clear error, or a fault."""
+"""Fuzzed calls and their verdicts: a result, a clear error, or a fault."""
 
 import pickle
 import re

@@ -1,4 +1,4 @@
-"""Command lines of ``duffing-env``: words of all kinds. Each must end with status 0 or 2, and say why in one line."""
+"""Fuzzing of ``duffing-env`` command lines: each must end with status 0 or 2, and give the reason in one line."""
 
 import contextlib
 import io

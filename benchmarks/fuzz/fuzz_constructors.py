@@ -1,4 +1,4 @@
-"""Constructors and functions: with one to three arguments that are anything."""
+"""Fuzzing of constructors and functions: one to three arguments are bad values."""
 
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Environments: `step` and `reset` with anything, single and vector."""
+"""Fuzzing of single and vector environments: `step` and `reset` with bad values."""
 
 import pickle
 from typing import Any

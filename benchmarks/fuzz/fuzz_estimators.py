@@ -1,4 +1,4 @@
-"""Online estimators: every method, with series of any scale, and anything in their place."""
+"""Fuzzing of online estimators: every method with series of any scale, or bad values instead."""
 
 import pickle
 from collections.abc import Callable, Iterator

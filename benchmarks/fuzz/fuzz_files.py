@@ -1,4 +1,4 @@
-"""Files of every kind: cut, with bits turned over, with other arrays or entries, or of another kind altogether."""
+"""Fuzzing of files of every kind: truncated, with flipped bits, with other arrays or entries, or of another kind."""
 
 import io
 import json
@@ -75,19 +75,23 @@ def calls() -> st.SearchStrategy[Call]:
     config = json.dumps(describe_run(TrainConfig()), default=str)
     progress = json.dumps(vars(TrainingProgress(steps=5, curve=[(1, 0.5, None)])))
     fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
-    #: Kind to the file's name, its content, what reads it, words of clear messages, and JSON to change in places.
+    settings, board = (HYPERPARAMETER_FOLDER / "ppo.toml").read_bytes(), "\n".join(entries).encode()
+    #: Kind to the file's name, its content, its reader, words of clear messages, and JSON to change in places.
     others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
         "rig": ("file", RIG.to_toml().encode(), Rig.from_file, (), ""),
         "csv": ("record.csv", _RECORD, lambda path: read_record_file(path, RIG), (), ""),
         "mat": ("record.mat", matlab.getvalue(), lambda path: read_record_file(path, RIG), (), ""),
         "run": ("config.json", config.encode(), lambda path: read_config(path.parent), fields, config),
-        "checkpoint": (STATE_FILE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress),
+        "checkpoint": (
+            STATE_FILE, progress.encode(), lambda path: load_progress(path.parent), ("checkpoint",), progress,
+        ),
         "settings": (
-            "file", (HYPERPARAMETER_FOLDER / "ppo.toml").read_bytes(), lambda path: read_hyperparameters("ppo", "duffing_env/Short-v0", path),
+            "file", settings, lambda path: read_hyperparameters("ppo", "duffing_env/Short-v0", path),
             ("settings", "hyperparameter"), "",
         ),
         "board": (
-            "file", "\n".join(entries).encode(), lambda path: leaderboard_file.leaderboard_rows(leaderboard_file.read_entries(path)), ("board",), entries[0],
+            "file", board, lambda path: leaderboard_file.leaderboard_rows(leaderboard_file.read_entries(path)),
+            ("board",), entries[0],
         ),
     }  # fmt: skip
     counter = iter(range(10**9))

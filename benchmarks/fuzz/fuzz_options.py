@@ -1,4 +1,4 @@
-"""Options of every track: one to three of them anything. What can be made is played for five samples."""
+"""Fuzzing of every track's options: one to three are bad values. An environment that can be made plays five samples."""
 
 from dataclasses import fields
 from typing import Any

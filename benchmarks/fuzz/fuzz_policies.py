@@ -1,4 +1,4 @@
-"""Policies: names, options and observations that are anything."""
+"""Fuzzing of policies: bad names, options and observations."""
 
 from typing import Any
 

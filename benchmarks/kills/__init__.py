@@ -1,1 +1,1 @@
-"""Kills: what is left when a command ends at a random moment, and what it is worth."""
+"""Kills of commands by SIGKILL at random moments: which files and results are left, and how much work is lost."""

@@ -3,11 +3,11 @@
 $ python -m benchmarks.kills --kills 50 --seed 0
 $ python -m benchmarks.kills --kills 6 --commands train run
 
-Each command runs to its end once, undisturbed. Half of the kills come at a moment between its first sign of life and
-its end, the other half within 50 ms of a moment when it wrote a file. After each kill every file is read, but those
-under temporary names; the command is started again as its user would, and has to end well; what it had measured before
-the kill has to be there. Where the same result is promised, it is compared bit for bit. The exit status is 1 where
-something of that failed.
+Each command first runs to its end once, undisturbed. Half of the kills come at a moment between its first output and
+its end, the other half within 50 ms of a moment when it wrote a file. After each kill every file is read, except under
+temporary names. The command is started again as a user would, must end well, and must have kept the measurements from
+before the kill. Where the documentation guarantees the same result, it is compared bit for bit. The exit status is 1
+where any of this failed.
 """
 
 import os
@@ -84,7 +84,7 @@ def main(config: Config) -> None:
 
 
 def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Kill a command so many times; what came of it."""
+    """Kill a command ``kills`` times, and count the outcomes."""
     whole = base / "whole"
     case.prepare(whole)
     _finish(case, whole, ["rig", "list"], "before")  # the packages are imported
@@ -108,7 +108,7 @@ def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[s
             faults += [f"{case.name}, kill {k}: what was measured is gone: {gone}"] if gone else []
             same = not case.promises or case.result(folder) == case.result(whole)
             told["equal"] += same
-            faults += [] if same else [f"{case.name}, kill {k}: the result is not that of the undisturbed command"]
+            faults += [] if same else [f"{case.name}, kill {k}: the result differs from the undisturbed command's"]
         except RuntimeError as error:
             faults.append(f"{case.name}: {error}")
         shutil.rmtree(folder)

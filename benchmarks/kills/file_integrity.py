@@ -1,4 +1,4 @@
-"""Is a file whole? Each is read as its kind is."""
+"""Finds damaged or half-written files in a folder, by reading each in its format."""
 
 import csv
 import json

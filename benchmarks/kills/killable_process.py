@@ -1,4 +1,4 @@
-"""Processes that run a command line, and that can be killed; the packages are imported once for all of them."""
+"""Processes that run a command line and can be killed; they are forked from one that has imported the packages."""
 
 import multiprocessing
 import os
@@ -12,7 +12,8 @@ from agents.cli import run_script
 #: The processes are forked from one that imported these.
 PRELOADED = (
     "torch", "stable_baselines3", "optuna", "matplotlib.figure", "duffing_env", "agents.commands.train_command",
-    "agents.evaluation.comparison", "research.studies.ship_policy", "agents.hardware.experiment_run", "estimator.identification",
+    "agents.evaluation.comparison", "research.studies.ship_policy", "agents.hardware.experiment_run",
+    "estimator.identification",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The commands that are killed: how each is started, goes on, and what it had measured."""
+"""The commands to kill: how each is started and resumed, and its measurements so far."""
 
 import csv
 import json
@@ -38,9 +38,9 @@ class Case:
 
     Attributes:
         name: in the table.
-        unit: of what a kill loses.
+        unit: unit of the loss by a kill.
         most: that it may lose.
-        promises: whether the result is promised to be the same.
+        promises: whether the documentation guarantees the same result.
         missing: why it cannot be tried here.
     """
 
@@ -194,7 +194,7 @@ class Ship(Case):
     name, unit = "research.studies.ship_policy", "files of before"
 
     def prepare(self, folder: Path) -> None:
-        """Two run folders of policies that nobody trained."""
+        """Two run folders of untrained policies."""
         from stable_baselines3 import PPO
 
         from agents.policies.networks.policy_saving import save_policy

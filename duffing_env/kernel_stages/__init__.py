@@ -1,1 +1,1 @@
-"""The stages of a compiled step: what no model changes, and what is generated from a model."""
+"""The stages of a compiled environment step: fixed functions, and functions generated from a model's equations."""

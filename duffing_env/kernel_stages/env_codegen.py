@@ -1,4 +1,4 @@
-"""What the engine generates for an environment: plant, judgement, reward and observation of any model, across lanes."""
+"""Code generation for an environment: plant, true coefficients, reward and observation of any model, across lanes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from estimator.models.model import Model
 
 @scalar_jit
 def capped_error(ratio):
-    """Relative error of an estimate, at most 1, from its ratio to the truth."""
+    """Relative error of an estimate, capped at 1, from its ratio to the truth."""
     deviation = abs(ratio - 1.0)
     return deviation if deviation < 1.0 else 1.0
 
@@ -38,7 +38,7 @@ _COMPILED_NAMES = {**RUNTIME_FUNCTIONS, "capped_error": capped_error}
 
 @cache
 def generated_functions(spec: KernelSpec) -> Any:
-    """The compiled functions of a kind of experiment: see `_environment_source` for their names."""
+    """The compiled functions of a kind of experiment, as attributes by the names in `_environment_source`."""
     digests = (spec.belief_model.digest, spec.plant_model and spec.plant_model.digest)
     key = source_digest(source_folders(__file__)) + repr((spec[2:], digests))
     return stored.load_generated(
@@ -47,7 +47,7 @@ def generated_functions(spec: KernelSpec) -> Any:
 
 
 def _environment_source(spec: KernelSpec) -> str:
-    """All functions; each says what it does."""
+    """The source of all functions, each with a docstring."""
     from estimator.engine.printer_numba import print_lane_loop
 
     row_of = block_layout(spec)
@@ -69,7 +69,7 @@ def _environment_source(spec: KernelSpec) -> str:
 
 
 def _random_walk_source(model: Model, loop: Any) -> str:
-    """``add_random_walk(W, variances)``: let the coefficients walk at random before a sample."""
+    """``add_random_walk(W, variances)``: add the variances of a sample's random walk to the coefficients'."""
     from estimator.engine.symbolic import symbol
 
     names = list(model.coefficients)
@@ -81,9 +81,9 @@ def _random_walk_source(model: Model, loop: Any) -> str:
 
 
 def _plant_source(model: Model, degree: int, loop: Any) -> str:
-    """``step_plant``: the plant over a sample with its noise, or over a Runge-Kutta step of it; and its sensors.
+    """``step_plant``: the plant over a sample with its noise, or over one Runge-Kutta step; ``measure_<k>``: a sensor.
 
-    A difference equation shows its first sensor as well; other sensors are ``measure_<k>``.
+    The step of a difference equation includes its first sensor.
     """
     from estimator.engine import symbolic
 
@@ -96,8 +96,8 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
     for a, x in enumerate(model.states):
         kick = strength * derivatives.noise[a] * w
         if model.is_continuous:
-            # The increment of the noise over a step of length h, and where it reaches a state only through others, its
-            # integral; of white noise the two are drawn jointly.
+            # A state takes the increment of the noise over a step of length h; a state that the noise reaches only
+            # through other states takes the integral. For white noise both are drawn jointly.
             h = symbol("length")
             through = sum(derivatives.jacobian[a][k] * strength * derivatives.noise[k] for k in range(model.n_states))
             direct, integral = h * w, h * h / 2 * w
@@ -124,15 +124,15 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
 
 
 def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
-    """``set_true_coefficients(W, j, step)``: the coefficients of lane j's plant, in the equations of plant and belief.
+    """``set_true_coefficients(W, j, step)``: lane j's coefficients in the equations of plant and belief.
 
-    And what estimates are multiplied by to be compared with its parameters: every sample would divide otherwise.
+    It also stores the inverse of each true parameter, so that no sample divides to compare an estimate with the truth.
     """
     from estimator.engine import symbolic
 
     parameter_symbols = {p: symbolic.symbol(p) for p in parameter_names(spec.truth_model)}
     lines, results = [], {}
-    # Each equation on its own: a plant's coefficients must not depend on what else is believed, to the last bit.
+    # Each equation on its own: a plant's coefficients must not depend on the believed model, to the last bit.
     for tag, model in zip("WX", {spec.truth_model: None, spec.belief_model: None}, strict=False):
         coefficient_values = {}
         for c in model.coefficients:
@@ -150,7 +150,7 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
 
 
 def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
-    """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` and ``NEW_ERROR`` beside the truth; and soundness."""
+    """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` at the truth and ``NEW_ERROR``; and their validity."""
     import sympy as sp
 
     from estimator.engine import symbolic
@@ -172,7 +172,7 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
 
 
 def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
-    """``evaluate_belief(W, j, step)`` for a new belief or truth, and ``finish_step(W, ...)``, what a step gave and what it ends."""
+    """``evaluate_belief(W, j, step)``: a new belief beside the truth; ``finish_step(W, ...)``: reward and flags."""
     import sympy as sp
 
     from estimator.engine.symbolic import symbol
@@ -180,7 +180,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     model = spec.belief_model
     lines, is_sound = _belief_beside_truth(spec)
     result_rows = {name: f"NEW_{name}" for name in ("LOG_DET", "LOG_DENSITY", "ERROR")}
-    source = loop("evaluate_belief", "Measure lane j's belief beside its truth.", lines, result_rows, "step", one=True)
+    source = loop("evaluate_belief", "Compare lane j's belief with its truth.", lines, result_rows, "step", one=True)
     select, is_positive, is_finite = (sp.Function(name) for name in ("select", "positive", "finite"))
     variances = {f"P_{name}_{name}" for name in model.names}
     checked_rows = [name for name in belief_rows(model) if not name.startswith("P_") or name in variances]
@@ -202,7 +202,7 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     weight_names = ("information_weight", "posterior_weight", "error_weight", "hook_weight")
     reward_terms = (symbol("GAIN"), symbol("POSTERIOR"), symbol("ERROR") - symbol("E_ERROR"), symbol("E_WORK"))
     reward = sum(symbol(weight) * value for weight, value in zip(weight_names, reward_terms, strict=True))
-    # In two lines, because SymPy squares the factors, and the input's square alone may overflow.
+    # In two lines: SymPy would square the factors, and the square of the input alone may overflow.
     lines.append(("EFFORT", symbol("sqrt_input_cost") * symbol("INPUT")))
     reward -= symbol("EFFORT") ** 2
     first_sensor = next(iter(model.outputs))
@@ -216,12 +216,12 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     results |= {"INFORMATION_GAIN": "GAIN", "LOG_POSTERIOR_GAIN": "POSTERIOR", "TERMINATED": "STOPPED"}
     results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED": "LATER"}
     uniform = ("step", "max_output", "horizon", "sqrt_input_cost", *weight_names)
-    doc = "What a sample gave, and whether it ends the episode; a belief that is broken gives nothing and ends it."
+    doc = "The reward of a sample, and whether it ends the episode; a broken belief pays nothing and ends it."
     return source + loop("finish_step", doc, lines, results, *uniform)
 
 
 def _observation_source(spec: KernelSpec) -> str:
-    """``observe(W, B, ...)``: the observation into the rows of a block ``B``; its prior is told entry by entry."""
+    """``observe(W, B, ...)``: the observation into the rows of a block ``B``, relative to the prior."""
     import sympy as sp
 
     from estimator.engine.printer_numba import print_lane_loop
@@ -246,7 +246,7 @@ def _observation_source(spec: KernelSpec) -> str:
     entries["last_input"] = symbol("INPUT") * symbol("per_input")
     for y in model.outputs:
         entries[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
-    # Of what does not change from lane to lane one division is enough; both are exactly 0 at the end.
+    # One division serves all lanes where a number does not differ between them; both entries end at exactly 0.
     entries["time_left"] = (symbol("horizon") - symbol("ELAPSED")) * symbol("per_horizon")
     entries["budget_left"] = 1 - symbol("SPENT") / symbol("budget")
     clip = sp.Function("clip")

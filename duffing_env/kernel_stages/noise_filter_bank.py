@@ -1,10 +1,9 @@
-"""Hypotheses about the noises in an environment: several beliefs learn side by side, and the mixture is what is seen.
+"""A bank of filters in each environment, one for each hypothesis about the noises; the environment shows their mixture.
 
-Their priors and their weights are those of `estimator.inference.noise_grid`. A *member* is one of these beliefs. Those of a
-block's environments lie in ``ceil(M n / LANES)`` blocks of their own, of M hypotheses and n environments `interleaved_envs`:
-member m of environment j in lane m n + j. So what is done member by member is done for n environments at once. Only
-what a member goes on from stands there, its record and its weight. The rest of an update is scratch, which stays in the
-nearest cache.
+`estimator.inference.noise_grid` gives their priors and weights. A *member* is the belief of one filter. The M members
+of a block's n environments (``interleaved_envs``) lie in ``ceil(M n / LANES)`` blocks of their own: member m of
+environment j in lane m n + j, so that each operation on a member runs for n environments at once. A member block holds
+records and weights only; the rest of an update is scratch, which stays in the nearest cache.
 """
 
 from __future__ import annotations
@@ -23,37 +22,37 @@ from estimator.inference.noise_mixture import apply_switching, compile_mixture, 
 
 
 def interleave_width(n_envs: int) -> int:
-    """Environments of a block whose members lie beside each other: a power of two, so that `LANES` is a multiple."""
+    """Number of environments whose members lie side by side in a block: a power of two that divides `LANES`."""
     return min(LANES, 1 << (n_envs - 1).bit_length())
 
 
 def n_member_blocks(n_envs: int, n_hypotheses: int) -> int:
-    """Blocks that their members take."""
+    """Number of blocks that the members of all environments take."""
     return -(-n_envs // LANES) * -(-n_hypotheses * interleave_width(n_envs) // LANES)
 
 
 class FilterBank(NamedTuple):
-    """What environments do with ``members`` (blocks, (size + 1) * LANES), those of a whole batch.
+    """Compiled functions on ``members`` (blocks, (size + 1) * LANES), the members of a whole batch.
 
     Attributes:
-        reset: ``reset(members, env_index, params)`` puts those of an environment to their priors.
-        update: ``update(W, members, block, params)`` updates those of a block's environments with its inputs and
-            outputs, and the environments' beliefs to their mixtures. Members of an environment that waits for its
-            reset stay as they are.
+        reset: ``reset(members, env_index, params)`` puts the members of an environment to their priors.
+        update: ``update(W, members, block, params)`` updates the members of a block's environments with its inputs and
+            outputs, and sets the environments' beliefs to the mixtures. The members of an environment that waits for
+            its reset stay as they are.
 
-    Lanes of a block behind ``params.interleaved_envs`` have none, and keep their beliefs.
+    Lanes of a block from ``params.interleaved_envs`` on have no members, and keep their beliefs.
     """
 
     reset: Any
     update: Any
 
 
-#: Those of a single belief, which has none.
+#: For environments with a single belief.
 NO_FILTER_BANK = FilterBank(None, None)
 
 
 def compile_filter_bank(spec: KernelSpec) -> FilterBank:
-    """Compile them for a kind of experiment."""
+    """Compile the filter bank of a kind of experiment."""
     row_of, model = block_layout(spec), spec.belief_model
     expectations = "sigma_points" if spec.uses_cubature else "first_order"
     task = compile_belief_update(
@@ -87,7 +86,7 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
 
     @compile_inner
     def update_block(U, V, W, n, has_waiting, params, energies_found):
-        """Update the members in a block U, by way of a whole block V; ``energies_found`` receives their free energies."""
+        """Update the members in block U by way of scratch block V; ``energies_found`` receives the free energies."""
         copy_range(V, 0, U, 0, weight_row)
         for to, source in copied_rows:
             for lane in range(0, LANES, n):

@@ -1,4 +1,4 @@
-"""Stages of a step that no model changes: scalar functions of a lane, which the kernel makes run across lanes."""
+"""Input limits, noise, parameter draws and reward payment of one environment, as scalar functions of its rows."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_
 from estimator.compilation.simd import LANES, jit, lanewise
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
-# A float32 action times the input's scale is this near to the float64 value it stands for (in parts of the scale).
+#: Distance of a float32 action from the float64 value that it stands for, at most, in parts of the input's scale.
 _FLOAT32_ROUNDING = 2.0**-22
 
 
 def draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
-    """Two standard normal numbers. The stream of an environment that waits for its reset stands still."""
+    """Draw two standard normal numbers; the stream of an environment that waits for its reset stands still."""
     first, a, b, c, d = sfc64_next(
         float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
     )
@@ -36,9 +36,9 @@ def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
 
 
 def limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
-    """The input that the generator gives when it is asked for one: near enough to the last, and paid for.
+    """The requested input, cut to the largest change from the last input and to the rest of the energy budget.
 
-    ``SPENT`` is the energy Σ u²; what is left of the budget bounds the next input, so it cannot be exceeded.
+    ``SPENT`` is the energy Σ u² so far; the rest of the budget bounds the next input, so it cannot be exceeded.
     """
     applied_input = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
     max_affordable = np.sqrt(max(budget - SPENT, 0.0))
@@ -47,15 +47,15 @@ def limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
 
 
 def replay_sample(INPUT, RECORDED_u, RECORDED_y, max_input):
-    """The recorded plant: a record answers the recorded input only."""
+    """The recorded input and output, and whether the action deviates from the recorded input."""
     deviates = abs(INPUT - RECORDED_u) > _FLOAT32_ROUNDING * max_input
     return RECORDED_u, RECORDED_y, 1.0 if deviates else 0.0
 
 
 def pay_reward(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, has_terminated_return, terminated_return):
-    """When the reward is paid, and what an episode that is terminated returns.
+    """Pay the reward now or at the end of the episode, and correct the return of a terminated episode.
 
-    ``EARNED`` is what the episode gave so far, as if it were paid sample by sample.
+    ``EARNED`` is the sum of the episode's rewards so far, as if every sample were paid.
     """
     already_paid = 0.0 if terminal else EARNED
     EARNED += REWARD
@@ -65,7 +65,7 @@ def pay_reward(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, has_terminated_r
 
 
 def draw_parameter_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
-    """The sample at which the first parameter jumps, in the middle half of the episode, and its log-uniform factor."""
+    """Draw the sample of the first parameter's jump, in the middle half of the episode, and its log-uniform factor."""
     low = math.log(1.0 - jump)
     first, a, b, c, d = sfc64_next(
         float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
@@ -78,9 +78,9 @@ def draw_parameter_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
 
 @jit
 def draw_plant_parameters(W, j, params, first_stream, first_parameter):
-    """The parameters of lane j's plant, each log-uniform about its centre, Gaussian or log-normal; then its noises.
+    """Draw the parameters of lane j's plant, each log-uniform, Gaussian or log-normal; then its noises.
 
-    ``first_stream`` and ``first_parameter`` say where the first word of the stream and the first parameter stand.
+    ``first_stream`` and ``first_parameter`` are the places of the stream's first word and of the first parameter.
     """
     a, b = float_to_word(W[first_stream + j]), float_to_word(W[first_stream + LANES + j])
     c, d = float_to_word(W[first_stream + 2 * LANES + j]), float_to_word(W[first_stream + 3 * LANES + j])
@@ -98,7 +98,7 @@ def draw_plant_parameters(W, j, params, first_stream, first_parameter):
                 abs(params.nominal_parameters[p]) > STDS_PER_90_PERCENT * params.parameter_stds[p]
                 and value * params.nominal_parameters[p] < 0.0
             ):
-                value = -value  # what is believed to have one sign keeps it
+                value = -value  # a parameter that is believed to have one sign keeps it
             W[first_parameter + p * LANES + j] = value
         else:
             W[first_parameter + p * LANES + j] = params.nominal_parameters[p] * math.exp(

@@ -28,7 +28,7 @@ from estimator.inference import mean_field
 
 
 def compile_truth_update(spec: KernelSpec, generated: Any, hooks: RewardHooks) -> Any:
-    """``update_truth(W, j, params)``: the true coefficients of lane j, after its parameters changed."""
+    """``update_truth(W, j, params)``: set lane j's true coefficients after its parameters changed."""
     set_true_coefficients, evaluate_belief = generated.set_true_coefficients, generated.evaluate_belief
     on_episode_start = hooks.on_episode_start
 
@@ -65,7 +65,7 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
             W[i * LANES + j] = params.prior[i]
         if has_noise_hypotheses:
             reset_filter_bank(members, b * LANES + j, params)
-        # Variables, because a function is compiled anew for every constant.
+        # Passed as variables: Numba compiles a function anew for every constant.
         plant_stages.draw_plant_parameters(W, j, params, np.int64(first_stream), np.int64(first_parameter))
         W[jump_at + j] = -1.0
         if params.jump > 0.0:
@@ -112,7 +112,7 @@ def compile_replay(spec: KernelSpec) -> Any:
 
 
 def compile_simulation(spec: KernelSpec, generated: Any, draw_noise: Any) -> Any:
-    """``simulate_sample(W)``: the plant over a sample with its noise, and its sensors. The first noise is drawn."""
+    """``simulate_sample(W)``: step the plant over a sample with its noise, and measure; the first noise is drawn."""
     assert spec.plant_model is not None
     model, n_outputs = spec.plant_model, spec.plant_model.n_outputs
     if n_outputs > 3:
@@ -145,7 +145,7 @@ def compile_simulation(spec: KernelSpec, generated: Any, draw_noise: Any) -> Any
 
 
 def compile_update(spec: KernelSpec) -> Any:
-    """``update(W)``, or of mean field ``update(W, iterations, as_published)``: the belief after a sample, in its rows."""
+    """``update(W)``, or of mean field ``update(W, iterations, as_published)``: the belief after a sample."""
     row_of = block_layout(spec)
     if spec.factorisation == "mean_field":
         return mean_field.compile_mean_field_loop(row_of)
@@ -156,7 +156,7 @@ def compile_update(spec: KernelSpec) -> Any:
 
 
 def compile_belief_restoration(spec: KernelSpec) -> Any:
-    """``restore_broken_beliefs(W, workspace)``: where a sample gave nothing, the belief before it."""
+    """``restore_broken_beliefs(W, workspace)``: put a belief that diverged back to its state before the sample."""
     offset_of, n_record = block_offsets(spec), len(belief_rows(spec.belief_model))
     diverged, off_record = offset_of["DIVERGED"], offset_of["OFF_RECORD"]
 
@@ -174,11 +174,12 @@ def compile_belief_restoration(spec: KernelSpec) -> Any:
 
 
 class HoldStages(NamedTuple):
-    """What a step does about the samples of an action after the first.
+    """Functions around every sample of a held action but the first.
 
     Attributes:
-        save_sample: ``save_sample(W, workspace)`` before such a sample: keep the block, and let what has ended wait.
-        add_sample: ``add_sample(W, workspace)`` after it: sum up, and put what had ended back to where it ended.
+        save_sample: ``save_sample(W, workspace)`` keeps the block before the sample; lanes that have ended wait.
+        add_sample: ``add_sample(W, workspace)`` adds the rewards of the samples so far; lanes that had ended before the
+            sample go back to their end.
     """
 
     save_sample: Any
@@ -186,7 +187,7 @@ class HoldStages(NamedTuple):
 
 
 def compile_hold(spec: KernelSpec) -> HoldStages:
-    """Compile them; the block is kept in the workspace behind the beliefs of `compile_belief_stage`."""
+    """Compile them; the workspace keeps the block behind the belief that the kernel saves in each sample."""
     offset_of, n_rows = block_offsets(spec), max(block_layout(spec).values()) + 1
     n_saved = len(belief_rows(spec.belief_model)) * LANES
     terminated, truncated, needs_reset = (offset_of[name] for name in ("TERMINATED", "TRUNCATED", "WAITING"))
@@ -197,7 +198,7 @@ def compile_hold(spec: KernelSpec) -> HoldStages:
     def save_sample(W, workspace):
         for i in range(n_rows * LANES):
             workspace[n_saved + i] = W[i]
-        for j in range(LANES):  # what has ended waits: its noise and its filter bank stay as they are
+        for j in range(LANES):  # a lane that waits draws no noise and updates no filter bank
             if W[terminated + j] + W[truncated + j] != 0.0:
                 W[needs_reset + j] = 1.0
 

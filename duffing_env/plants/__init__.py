@@ -1,1 +1,1 @@
-"""Plants that are not simulated from a model's prior: the Silverbox record and its identified twin."""
+"""The Silverbox circuit: its record, and the twin identified from the record."""

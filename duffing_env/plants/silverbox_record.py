@@ -7,11 +7,11 @@ nonlinear system identification", ECC 2013) is one measurement of an electronic 
 - the *arrow*, filtered Gaussian noise whose amplitude grows linearly: Kouw (2020) validates on it;
 - the *multisine*, ten odd random-phase multisines: Kouw (2020) trains on it.
 
-The data may not be redistributed, so it is looked for on this machine (`load_record`). Where it is
+The data may not be redistributed, so `load_record` searches this machine for it. Where it is
 absent, `synthesise_multisine` and `synthesise_arrow` make the same excitations from the published
 description at the amplitudes of the record. They leave out the record's mean input of 6.2 mV,
-which belongs to the instruments and not to the excitation, and the slope that the generator's
-analogue filter puts on the record's spectrum (4 dB from the first to the last harmonic).
+which belongs to the instruments and not to the excitation, and the slope of the record's spectrum
+by the generator's analogue filter (4 dB from the first to the last harmonic).
 """
 
 import hashlib
@@ -38,21 +38,34 @@ ARROW_SAMPLES = 40_100
 
 REGIME_NAMES = ("multisine", "arrow")
 
+#: Samples of a period of the multisine.
 PERIOD_SAMPLES = 8192
-ODD_HARMONICS = np.arange(1, 2 * 1342, 2)  # of 1 / PERIOD: 0.07 Hz to 199.9 Hz
-TRANSIENT_SAMPLES = 400
-GAP_SAMPLES = 100
-MULTISINE_RMS = 0.02234  # V; average over the record's ten steady periods, mean removed
 
+#: Harmonics of the multisine, in multiples of 1 / period: 0.07 Hz to 199.9 Hz.
+ODD_HARMONICS = np.arange(1, 2 * 1342, 2)
+
+#: Samples of transient before each period.
+TRANSIENT_SAMPLES = 400
+
+#: Zeros before each realisation.
+GAP_SAMPLES = 100
+
+#: RMS of the multisine [V]: average over the record's ten steady periods, mean removed.
+MULTISINE_RMS = 0.02234
+
+#: Order of the arrow's low-pass filter.
 ARROW_ORDER = 9
-ARROW_CUTOFF = 200.0  # Hz
-# V; RMS of the arrow's last sample: that of (u_t - mean) · 40,100 / t over the record's arrow. The
-# peak is then 0.142 ± 0.011 V (300 draws); the record's is 0.143 V, or 0.149 V with its mean.
+
+#: Cut-off frequency of the arrow's low-pass filter [Hz].
+ARROW_CUTOFF = 200.0
+
+#: RMS at the arrow's last sample [V]: the RMS of (u_t - mean) · 40,100 / t over the record's arrow.
+#: The peak is then 0.142 ± 0.011 V (300 draws); the record's is 0.143 V, or 0.149 V with its mean.
 ARROW_END_RMS = 0.039
 
 
 class RecordNotFound(FileNotFoundError):
-    """The Silverbox record is in none of the places searched; the message says how to get it."""
+    """The Silverbox record is in none of the searched places; the message says how to get it."""
 
 
 class RecordDamaged(ValueError):
@@ -111,14 +124,14 @@ def load_record(path: str | Path | None = None) -> SilverboxRecord:
     3. this project's cache, `platformdirs.user_cache_dir("duffing-env")/silverbox`;
     4. the cache of the package `nonlinear_benchmarks`.
 
-    A place that is named, by `path` or by `SILVERBOX_DATA`, must hold the record: the search does
-    not go on past it. Nor does it go on past a damaged file.
+    A place that `path` or `SILVERBOX_DATA` names must hold the record: the search ends there. It
+    also ends at a damaged file.
 
     Both files give the identical record: the CSV holds the values of the .mat rounded to five
     significant digits, so the values of the .mat are rounded likewise.
 
     Raises:
-        RecordNotFound: The record is not in the place that was named, or not in any place.
+        RecordNotFound: The record is not in the named place, or in none of the places.
         RecordDamaged: The file found has a wrong SHA-256.
     """
     found = _find_record_file(path)
@@ -202,8 +215,8 @@ def _read_record(file: Path) -> SilverboxRecord:
 
 
 def _round_to_five_digits(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    # By way of text, because arithmetic rounding does not always give the double nearest to the
-    # decimal number, which is what reading the CSV gives.
+    # By way of text: the CSV's reader gives the double nearest to the decimal number, which
+    # rounding by arithmetic does not always give.
     return np.array([float(f"{value:.5g}") for value in values.tolist()])
 
 

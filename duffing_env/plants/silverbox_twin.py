@@ -1,4 +1,4 @@
-"""The twin: the oscillator nearest to the Silverbox circuit, identified from its record.
+"""Identifies the twin of the Silverbox circuit: the Duffing oscillator that fits its record best.
 
 Run ``python -m duffing_env.plants.silverbox_twin`` with the record at hand to print the constants of
 `estimator.rigs.silverbox_constants.SILVERBOX_TWIN` and of `estimator.rigs.silverbox_constants.SILVERBOX_ODE_TWIN`.
@@ -32,8 +32,8 @@ def identify_difference_twin(record: SilverboxRecord) -> tuple[Parameters, float
 def identify_continuous_twin(record: SilverboxRecord) -> Parameters:
     """The parameters (m, c, a, b) of the differential equation, from the record's multisine part.
 
-    By `duffing` with the spline through all inputs. Its offsets and feedthrough are identified along, and left away:
-    they are the circuit's and the sensor's, not the oscillator's.
+    The model is `duffing` with a spline through all inputs. Its offsets and feedthrough are identified too, but left
+    out: they belong to the circuit and the sensor, not to the oscillator.
     """
     model = duffing(offsets=True, feedthrough=True, noise="held")
     estimator = OnlineEstimator(model, rig=Rig.silverbox("spline"))

@@ -1,1 +1,1 @@
-"""The environment as a picture."""
+"""Rendering of an environment's episode as a picture."""

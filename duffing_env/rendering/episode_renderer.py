@@ -1,6 +1,6 @@
-"""The environment as a picture: input and output on the left, what is believed of the parameters on the right.
+"""Renders an episode: input and output over time on the left, the posterior of the parameters on the right.
 
-Those are m, c, a and b of a Duffing oscillator, and of another model its first four.
+The parameters are m, c, a and b of a Duffing oscillator, and the first four of another model.
 """
 
 from __future__ import annotations
@@ -28,33 +28,35 @@ Frame = npt.NDArray[np.uint8]
 WIDTH, HEIGHT = 960, 540
 """Size of a frame in pixels."""
 
-#: Most of the width that the heading may take: the status of a long episode begins behind it.
+#: Largest width of the heading, in parts of the frame: the status of a long episode begins behind it.
 _MAX_HEADING_WIDTH = 0.13
 
 MAX_SAMPLES_SHOWN = 256
 """Samples on the time axes. Longer episodes scroll: more samples would hide the single periods."""
 
-#: What m, c, a and b are called, and how many parameters of another model are shown.
+#: Labels of the Duffing oscillator's parameters.
 _PARAMETER_LABELS = {"m": "mass m", "c": "damping c", "a": "stiffness a", "b": "cubic b"}
+
+#: Largest number of parameters of another model that are shown.
 _MAX_PARAMETERS = 4
 
-#: An episode of so many seconds is drawn in seconds.
+#: Length of the time axis from which it is in seconds rather than milliseconds [s].
 _SECONDS_AXIS_FROM = 10.0
 
-#: The part of the height that the parameters' panels share.
+#: Height that the parameters' panels share, in parts of the frame.
 _PARAMETER_PANELS_HEIGHT = 0.82
 
 
 class EpisodeRenderer:
     """Draws one episode after another: as RGB arrays and, in mode ``human``, in a window.
 
-    Copies and pickles go on drawing, but have no window: a planner that tries inputs on a copy shows nothing.
+    Copies and pickles continue to draw, but have no window: a planner that tries inputs on a copy shows nothing.
 
     Args:
         render_mode: ``rgb_array``, or ``human``: then `start` and `add_sample` show the frame in a window.
-        max_input, max_output: where the limits are drawn, inside.
-        scales: what one inside is worth outside, where all is drawn.
-        fps: frames per second that the window does not exceed.
+        max_input, max_output: limits to draw, in internal units.
+        fps: largest number of frames per second in the window.
+        scales: factors from internal to physical units, which the picture shows.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: in mode ``human`` without pygame.
@@ -78,20 +80,20 @@ class EpisodeRenderer:
         self._horizon = horizon
         self._samples = 0
         self._prior_entropy = belief.entropy()
-        # Input, output and the belief after them; nothing was applied before the prior.
+        # Input, output and the belief after them; the prior has no input and output before it.
         self._history: deque[tuple[float, float, Belief]] = deque(
             [(np.nan, np.nan, belief)], maxlen=MAX_SAMPLES_SHOWN + 1
         )
         self._show()
 
     def add_sample(self, u: float, y: float, belief: Belief) -> None:
-        """Take note of a sample: the input applied, the output that followed, both inside, and the belief after it."""
+        """Add a sample: the applied input, the output after it, both in internal units, and the belief after it."""
         self._samples += 1
         self._history.append((self._scales.input * u, self._scales.output * y, belief))
         self._show()
 
     def frame(self) -> Frame:
-        """The episode so far (of a long one the last `MAX_SAMPLES_SHOWN` samples) as a new RGB array (HEIGHT, WIDTH, 3)."""
+        """The episode so far, at most its last `MAX_SAMPLES_SHOWN` samples, as a new RGB array (HEIGHT, WIDTH, 3)."""
         if self._figure_cache is None:
             self._figure_cache = _EpisodeFigure(*self._limits, self._scales, self._model, self._labels)
         inputs, outputs, beliefs = zip(*self._history, strict=True)
@@ -122,7 +124,7 @@ class EpisodeRenderer:
 
 
 def shown_parameters(model: Model) -> list[str]:
-    """The parameters that are shown: m, c, a and b of what has them, else the first ones.
+    """Names of the shown parameters: m, c, a and b of a model that has them, else the first ones.
 
     Example:
         >>> from estimator.models import MODELS
@@ -134,9 +136,9 @@ def shown_parameters(model: Model) -> list[str]:
 
 
 def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray]:
-    """(parameters, n) means and standard deviations of what is shown, first order.
+    """(parameters, n) means and standard deviations of the shown parameters, to first order.
 
-    NaN where a belief has none: the map may divide by the gain (η), whose mean is about 0.4 but may pass 0 on the way.
+    NaN where a belief has none: the map may divide by the gain (η), whose mean is about 0.4 but may pass 0.
     """
     model, scales = beliefs[0].model, beliefs[0].scales
     names = list(model.coefficients)
@@ -144,7 +146,7 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
     mean = np.array([belief.coefficients_mean for belief in beliefs])
     cov = np.array([belief.coefficients_cov for belief in beliefs])
     is_finite = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2))
-    if model.physical:  # what has no map divides by nothing
+    if model.physical:  # a model without this map divides by nothing
         is_finite &= np.abs(mean[:, gain]) > 1e-12
     shown, parameters = shown_parameters(model), list(model.physical or model.coefficients)
     means, stds = np.full((2, len(shown), len(beliefs)), np.nan)
@@ -158,7 +160,7 @@ def _physical_moments(beliefs: Sequence[Belief]) -> tuple[FloatArray, FloatArray
 
 
 class _EpisodeFigure:
-    """The figure, on the Agg canvas itself: pyplot would look for a display, and keep the figure for good.
+    """The figure, on an Agg canvas: pyplot would look for a display, and never release the figure.
 
     Axes and labels are drawn when the time axes change, and kept as a background; a frame adds curves and numbers.
     """
@@ -172,7 +174,7 @@ class _EpisodeFigure:
 
         self._figure = Figure((WIDTH / 100, HEIGHT / 100), dpi=100, facecolor="white")
         self._canvas = FigureCanvasAgg(self._figure)
-        # What the time axes count in: an episode takes a fraction of a second, or minutes.
+        # Unit of the time axes: an episode takes a fraction of a second, or minutes.
         self._unit, factor = ("ms", 1e3) if MAX_SAMPLES_SHOWN * scales.step < _SECONDS_AXIS_FROM else ("s", 1.0)
         self._sample = factor * scales.step
         self._background: Any = None
@@ -192,7 +194,7 @@ class _EpisodeFigure:
         self._panels: tuple[SignalPanel | ParameterPanel, ...] = (*self._signals, *self._parameters)
         style: dict[str, Any] = {"color": INK, "verticalalignment": "center_baseline"}
         heading = self._figure.text(0.06, 0.945, title, fontsize=12, weight="bold", **style)
-        # The name of a model is made as small as it has to be to end before the status begins.
+        # The name of a model shrinks until it ends before the status begins.
         wide = heading.get_window_extent(self._canvas.get_renderer()).width / WIDTH
         heading.set_fontsize(min(12.0, 12.0 * _MAX_HEADING_WIDTH / wide))
         self._status = self._figure.text(0.47, 0.945, "", fontsize=9, ha="right", animated=True, **style)
@@ -209,9 +211,9 @@ class _EpisodeFigure:
             status: the line beside the title.
             extent: first and last sample of the time axes. The arrays begin with the first.
             signals: (2, n) inputs and outputs [V].
-            means: (parameters, n) of what is shown.
+            means: (parameters, n) means of the shown parameters.
             stds: (parameters, n) their standard deviations.
-            truth: (parameters,) the true ones.
+            truth: (parameters,) their true values.
         """
         if extent != self._extent:
             self._draw_background(extent)
@@ -273,7 +275,7 @@ class _EpisodeFigure:
 
 
 def _axis_labels(belief: Belief) -> dict[str, float]:
-    """What the parameters that are shown are called, and the power of ten that their numbers are in, by a prior."""
+    """Label of each shown parameter to the power of ten of its axis, by a prior."""
     model, labels = belief.model, {}
     units = {name: belief.scales.unit(d) for name, d in model.dimensions.items()} or model.coefficients
     means, stds = _physical_moments([belief])
@@ -290,7 +292,7 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 class _PygameWindow:
-    """A window of pygame's that shows frames."""
+    """A pygame window that shows frames."""
 
     def __init__(self, fps: float) -> None:
         try:
@@ -307,7 +309,7 @@ class _PygameWindow:
         self._clock = pygame.time.Clock()
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, once the last has been seen for 1 / fps."""
+        """Show a frame, once the last one has been shown for 1 / fps seconds."""
         self._pygame.event.pump()
         self._surface.blit(self._pygame.image.frombuffer(frame.tobytes(), (WIDTH, HEIGHT), "RGB"), (0, 0))
         self._clock.tick(self._fps)

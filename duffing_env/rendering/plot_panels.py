@@ -1,4 +1,4 @@
-"""The panels of the picture of an environment: a signal, and a parameter, over time."""
+"""Matplotlib panels of an environment's picture: a signal over time, and a parameter's posterior over time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
 _TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
 
-# A curve ends in a dot. What is "animated" Matplotlib leaves out of the background.
+#: A curve ends in a dot. Matplotlib leaves "animated" artists out of the background.
 _CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "animated": True}
 
 
 class SignalPanel:
-    """Input or output over time, between its limits. ``animated_artists``: what a frame draws over the background."""
+    """Input or output over time, between its limits. A frame draws ``animated_artists`` over the background."""
 
     def __init__(self, axes: Any, name: str, limit: float, drawstyle: str) -> None:
         self.axes = axes
@@ -39,13 +39,14 @@ class SignalPanel:
 class ParameterPanel:
     """Mean and credible band of one parameter as deviations from the truth, and as numbers above."""
 
-    _EDGE = 150.0  # [%]; what is further from the truth is drawn there
+    #: Largest deviation from the truth that is drawn [%]; larger ones are drawn there.
+    _EDGE = 150.0
 
     def __init__(self, axes: Any, name: str, unit: float) -> None:
         self.axes = axes
         self._unit = unit
         axes.set_title(name, loc="left", color=INK, **_TITLE)
-        # Linear near the truth and logarithmic away from it: a belief contracts by a factor of a hundred and more.
+        # Linear near the truth and logarithmic away from it: a posterior contracts by a factor of a hundred and more.
         axes.set_yscale("asinh", linear_width=0.3)
         axes.set_ylim(-1.2 * self._EDGE, 1.2 * self._EDGE)
         axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["−100", "−10", "−1", "", "1", "10", "100"])

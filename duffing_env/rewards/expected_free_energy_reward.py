@@ -1,12 +1,12 @@
-"""The reward ``expected_free_energy``: what a sample teaches as it is expected, before its outcome is seen.
+"""The reward ``expected_free_energy``: expected information gain of a sample, before its outcome.
 
-The belief before the sample, with the input that is chosen, predicts the outputs. Conditioning on them shrinks the
-coefficients' covariance from C to C', whatever they turn out to be, to first order:
+The belief before the sample predicts the outputs for the chosen input. To first order, conditioning on the outputs
+shrinks the coefficients' covariance from C to C', whatever their values:
 
     I = ½ log det C - ½ log det C'    [nats],
 
-which is what the expected free energy counts as epistemic: the mutual information of outputs and coefficients. The
-prediction is the structured one for every belief; of a mean-field one the covariances between its factors are zero.
+the epistemic term of the expected free energy: the mutual information of outputs and coefficients. The prediction is
+the structured one for every belief; in a mean-field belief the covariances between its factors are zero.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from estimator.engine.storage_layout import integrator_rows
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
-    """``expect_sample(W)``: an imagined sample at the belief."""
+    """``expect_sample(W)``: the expected information of the next sample, linearised at the belief."""
     from estimator.engine.symbolic import symbol
 
-    # γ counts the noise as the first sensor shows that of one sample; N is of unit strength.
+    # γ is the precision of one sample's process noise in the first sensor; the model's noise has unit strength.
     noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
     noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in spec.belief_model.outputs}
     return expected_sample_source("expect_sample", spec, loop, noises)
@@ -39,13 +39,13 @@ def expected_sample_source(
     first_assignments: Sequence[tuple[str, Any]] = (),
     keeps_covariance: bool = False,
 ) -> str:
-    """Source of ``name(W)``: outputs as expected; leaves ½ log det C - ½ log det C' in ``WORK`` [nats].
+    """Source of ``name(W)``, which leaves ½ log det C - ½ log det C' of a sample in ``WORK`` [nats].
 
     Args:
-        name: of the function.
-        spec: whose model is believed.
-        loop: as `duffing_env.kernel_stages.env_codegen` makes it.
-        substitutions: quantity of the model to what stands in its place: another row, or an expression.
+        name: name of the function.
+        spec: kind of experiment with the believed model.
+        loop: loop printer of `duffing_env.kernel_stages.env_codegen`.
+        substitutions: quantity of the model to the row or expression in its place.
         first_assignments: assignments that come first.
         keeps_covariance: whether the covariance afterwards is kept, in the rows of ``substitutions``.
     """
@@ -94,7 +94,7 @@ def expected_sample_source(
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
-    """It expects before the belief is updated."""
+    """A hook that computes the expected information before the belief update."""
     expect_sample = generated.expect_sample
 
     @jit_closure(spec.name)

@@ -1,8 +1,8 @@
-"""The reward ``fisher``: what the outputs say of the coefficients to one who knows the truth.
+"""The reward ``fisher``: Fisher information of the outputs about the coefficients, at the true plant.
 
-The covariance recursion of the structured update, linearised not at the belief but at the true plant, where it truly
-is, and with the true noises: its covariance of the coefficients is (Λ0 + F)⁻¹ with Λ0 the prior's precision and F the
-Fisher information of the outputs so far. The recursion needs no output, so no estimator can talk it into anything.
+The covariance recursion of the structured update runs with the true noises, linearised at the true plant and its true
+state instead of the belief. Its covariance of the coefficients is (Λ0 + F)⁻¹, with the prior's precision Λ0 and the
+Fisher information F of the outputs so far. The recursion uses no output, so no belief changes it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from estimator.engine.storage_layout import belief_rows
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
-    """``update_ideal(W)``: an imagined sample at the truth."""
+    """``update_ideal(W)``: the covariance of an efficient estimator after a sample, linearised at the truth."""
     from estimator.engine.symbolic import symbol
 
     model = spec.belief_model
@@ -29,7 +29,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
-    """It starts from the prior, and counts a sample before the plant moves."""
+    """Hooks that start from the prior and add each sample's information before the plant moves."""
     row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.update_ideal
     names = belief_rows(model)
     information_rows = tuple(
@@ -41,7 +41,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
 
     @jit_closure(spec.name)
     def start_information(W, j, params):
-        if W[elapsed_row + j] == 0.0:  # a truth that changes in an episode does not take back what was known
+        if W[elapsed_row + j] == 0.0:  # a truth that changes within an episode keeps the information so far
             for index, row in information_rows:
                 W[row + j] = params.prior[index]
 

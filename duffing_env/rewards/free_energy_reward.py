@@ -1,4 +1,4 @@
-"""The reward ``free_energy``: minus the free energy of the sample, which the update leaves."""
+"""The reward ``free_energy``: minus the variational free energy of the sample after the belief update."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from estimator.inference import mean_field
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
-    """It reads what the update leaves."""
+    """A hook that reads the free energy after the update."""
     free_energies_of, reward_row = _compile_free_energies(spec), block_layout(spec)["WORK"] * LANES
 
     @jit_closure(spec.name)
@@ -29,7 +29,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
 
 
 def _compile_free_energies(spec: KernelSpec) -> Any:
-    """``find(W, energies)``: what the last update left every lane with [nats]."""
+    """``free_energies_of(W, energies)``: every lane's free energy after the last update [nats]."""
     row_of = block_layout(spec)
     if spec.has_noise_hypotheses:
         free_energy_row = row_of["FREE_ENERGY"] * LANES

@@ -7,8 +7,11 @@ from typing import Any
 
 from estimator.models.model import Model
 
-#: Bounds of a determinant that has a logarithm: below, numbers lose digits.
-_MIN_DETERMINANT, _MAX_DETERMINANT = 2.0**-1000, 2.0**1000
+#: Smallest determinant that has a logarithm: below it, numbers lose digits.
+_MIN_DETERMINANT = 2.0**-1000
+
+#: Largest determinant that has a logarithm.
+_MAX_DETERMINANT = 2.0**1000
 
 
 def log_det_and_density(
@@ -20,10 +23,10 @@ def log_det_and_density(
     """Assignments of an L D Lᵀ factorisation of the coefficients' covariance.
 
     Args:
-        model: whose coefficients.
-        deviations: coefficient to the deviation at which the density is asked for; None for none.
-        covariance_entries: ``P_i_j`` to what stands in its place.
-        prefix: of the names that are assigned.
+        model: model with these coefficients.
+        deviations: coefficient to its deviation from the mean, for the density; None for no density.
+        covariance_entries: ``P_i_j`` to the expression in its place.
+        prefix: prefix of the assigned names.
 
     Returns:
         The assignments, and in symbols the determinant, the squared deviation in units of the covariance, and 1 where

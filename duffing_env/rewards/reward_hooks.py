@@ -1,4 +1,4 @@
-"""The compiled functions of a reward that the kernel calls at fixed points of a step."""
+"""Reward hooks: compiled functions of a reward that the kernel calls at fixed points of a step."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from estimator.compilation.simd import jit
 
 
 class RewardHooks(NamedTuple):
-    """Work of a reward's own, compiled into the kernel; it leaves its result in row ``WORK``.
+    """The compiled functions that compute a reward's term and leave it in row ``WORK``.
 
     Attributes:
         on_episode_start: ``on_episode_start(W, j, params)`` where an episode begins in lane j, or its truth changes.
         before_plant_step: ``before_plant_step(W, params)`` before the plant moves.
-        before_update: ``before_update(W, params)`` before the belief is updated.
-        after_update: ``after_update(W, params)`` after it.
+        before_update: ``before_update(W, params)`` before the belief update.
+        after_update: ``after_update(W, params)`` after the belief update.
     """
 
     on_episode_start: Any
@@ -25,12 +25,12 @@ class RewardHooks(NamedTuple):
 
 @jit
 def no_hook(W, params):
-    """A hook that has nothing to do."""
+    """A hook that does nothing."""
 
 
 @jit
 def no_lane_hook(W, j, params):
-    """The same, of one lane."""
+    """A hook of one lane that does nothing."""
 
 
 #: The hooks of a reward that is a weighted sum alone.

@@ -1,14 +1,14 @@
-"""The reward ``simulation_error``: how far the believed oscillator runs from the true one, on its own.
+"""The reward ``simulation_error``: error of a free simulation of the believed oscillator beside the true one.
 
-Both are put at rest and given the same test input, without noise; what they do is compared:
+Both start at rest and get the same test input, without noise; their outputs are compared:
 
     misfit = min(sqrt(Σ (x_believed - x_true)² / Σ x_true²), 1).
 
-The believed one has the posterior's means for its coefficients. One that runs away, or is NaN, has a misfit of 1.
+The believed oscillator has the posterior's means for its coefficients. If it diverges or is NaN, its misfit is 1.
 
-The test input is a Schroeder multisine of `TEST_SAMPLES` samples: the first 20 multiples of 9.5 Hz, so up to 191 Hz as the
-Silverbox's, all of one size. Its peak is half of ``max_input``, with which oscillators of the standard tracks come to
-0.35 V at most.
+The test input is a Schroeder multisine of `TEST_SAMPLES` samples: the first 20 multiples of 9.5 Hz at equal amplitude,
+so up to 191 Hz as the Silverbox's multisine. Its peak is half of ``max_input``, which moves the oscillators of the
+standard tracks by at most 0.35 V.
 """
 
 from __future__ import annotations
@@ -25,14 +25,18 @@ from estimator.engine.input_hold import compile_input_writer
 from estimator.engine.storage_layout import input_rows
 from estimator.support.array_types import FloatArray
 
-#: Length of the test input: 105 ms.
+#: Length of the test input [samples]: 105 ms.
 TEST_SAMPLES = 64
 
-_N_HARMONICS, _PEAK_FRACTION = 20, 0.5
+#: Harmonics of the test input.
+_N_HARMONICS = 20
+
+#: Peak of the test input, in parts of ``max_input``.
+_PEAK_FRACTION = 0.5
 
 
 def _schroeder_multisine() -> FloatArray:
-    """The test input (SAMPLES,), in parts of ``max_input``."""
+    """The test input (TEST_SAMPLES,), in parts of ``max_input``."""
     harmonics = np.arange(1, _N_HARMONICS + 1)
     phases = -np.pi * harmonics * (harmonics - 1) / _N_HARMONICS
     times = np.arange(TEST_SAMPLES)[:, None] / TEST_SAMPLES
@@ -44,7 +48,7 @@ TEST_INPUT = _schroeder_multisine()
 
 
 def hook_source(spec: KernelSpec, loop: Any) -> str:
-    """``step_believed`` and ``step_true``: the believed and the true plant; ``add_difference`` adds up, ``finish_misfit`` ends."""
+    """``step_believed`` and ``step_true`` step the plants, ``add_difference`` and ``finish_misfit`` compare them."""
     import sympy as sp
 
     from estimator.engine.symbolic import differentiate, propagate_state, substitute, symbol
@@ -76,7 +80,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
-    """It compares where an episode begins, and after every update."""
+    """Hooks that run both plants at the start of an episode and after every update."""
     row_of, model = block_layout(spec), spec.belief_model
     first, last = row_of[f"MODEL_{next(iter(model.states))}"] * LANES, (row_of["POWER"] + 1) * LANES
     rows = [row_of[row] for row in input_rows(model, spec.degree)]
@@ -92,7 +96,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
 
     @jit_closure(spec.name)
     def run_free_simulation(W, max_input):
-        """The misfits of a block's beliefs."""
+        """Write the misfit of every lane's belief, and its decrease."""
         saved_inputs = np.empty(len(inputs) * LANES)
         for k in range(len(inputs)):
             copy_range(saved_inputs, k * LANES, W, inputs[k], LANES)
@@ -118,7 +122,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
 
     @jit_closure(spec.name)
     def start_simulation_error(W, j, params):
-        """Of lane j alone: the other lanes keep what they had."""
+        """Write the misfit of lane j alone: the other lanes keep theirs."""
         saved_rewards, saved_misfits = np.empty(LANES), np.empty(LANES)
         copy_range(saved_rewards, 0, W, reward_row, LANES)
         copy_range(saved_misfits, 0, W, misfit_row, LANES)

@@ -1,4 +1,4 @@
-"""Arrays that are given out with every step, without a copy each time."""
+"""A pool of output arrays: every step returns an array without a copy, and reuses one that nothing else references."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy.typing as npt
 
 
 class ArrayPool:
-    """Arrays of one shape, given out one after another, and given out again when nobody else holds them any more.
+    """Arrays of one shape, reused when the pool holds the only reference.
 
-    What a step returns stays the caller's. A step writes into an array that nobody holds, so nothing is copied.
+    The caller keeps the array that a step returned, and the next step writes into another one, so nothing is copied.
 
     Args:
         shape: of the arrays.
         dtype: of the arrays.
     """
 
-    #: Arrays that are remembered. Whoever keeps all that is given out gets new ones.
+    #: Arrays that the pool remembers. A caller that keeps more than these gets new ones.
     MAX_ARRAYS = 4
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
@@ -28,7 +28,7 @@ class ArrayPool:
         self._unshared_count = self._reference_count(0)
 
     def acquire(self) -> npt.NDArray[Any]:
-        """An array that nobody else holds, itself or through a view. What it contains has no meaning."""
+        """An array without any other reference, direct or through a view. Its numbers have no meaning."""
         for i in range(len(self._arrays)):
             if self._reference_count(i) == self._unshared_count:
                 return self._arrays[i]

@@ -1,7 +1,7 @@
-"""What an experiment is compiled for, the rows of its block, and what its kernel is told.
+"""The compile-time specification and run-time parameters of a kernel, and the rows of a block of environments.
 
-Environments lie in blocks of `estimator.compilation.simd.LANES`. A block holds the rows of the estimator first
-(`estimator.engine.storage_layout.update_layout`), then those of the plant and of the episode.
+A block holds `estimator.compilation.simd.LANES` environments: first the rows of the estimator
+(`estimator.engine.storage_layout.update_layout`), then the rows of the plant and of the episode.
 """
 
 from __future__ import annotations
@@ -20,29 +20,31 @@ from estimator.engine.storage_layout import belief_rows, integrator_rows, trace_
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 
-#: What a step leaves for an environment's face, in adjacent rows of its block.
+#: Adjacent rows of a block with the outcome of a step: reward, gains and flags.
 OUTCOME_ROWS = (
     *("REWARD", "INFORMATION_GAIN", "LOG_POSTERIOR_GAIN"),
     *("TERMINATED", "TRUNCATED", "DIVERGED", "OFF_RECORD"),
 )
 
-#: Those of them that add up over the samples of a step; the others are as the last sample leaves them.
+#: Outcomes that add up over the samples of a step; the last sample alone sets the others.
 SUMMED_OUTCOMES = ("REWARD", "INFORMATION_GAIN", "LOG_POSTERIOR_GAIN")
 
 
 class KernelSpec(NamedTuple):
-    """What a kernel is compiled for.
+    """The kind of an experiment: each kind has a kernel of its own.
 
     Attributes:
-        belief_model: the model that is believed.
+        belief_model: the model of the belief.
         plant_model: the model that is simulated; None where a record is replayed.
-        degree: of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one.
+        degree: degree of the input over a sample of a differential equation: 0 held, 1 linear from the last input on.
         factorisation: ``structured``, or the paper's ``mean_field``.
-        iterations: variational iterations per sample of the structured belief, whose update is generated with them; 0
-            for mean field, which is told.
-        reward_hooks: name of the reward, if it has hooks (`duffing_env.rewards.reward_registry`); the others are weights that a kernel is told.
-        has_noise_hypotheses: whether several beliefs are weighed (`duffing_env.kernel_stages.noise_filter_bank`); how many is told.
-        uses_cubature: whether these are moved by sigma points (`estimator.engine.uses_cubature`).
+        iterations: variational iterations per sample that the structured update is generated with; 0 for mean field,
+            which takes them from `KernelParams`.
+        reward_hooks: name of a reward with hooks (`duffing_env.rewards.reward_registry`); empty for the other rewards,
+            whose weights are in `KernelParams`.
+        has_noise_hypotheses: whether an environment weighs several beliefs
+            (`duffing_env.kernel_stages.noise_filter_bank`); their number is in `KernelParams`.
+        uses_cubature: whether sigma points propagate these beliefs (`estimator.engine`).
     """
 
     belief_model: Model
@@ -56,7 +58,7 @@ class KernelSpec(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What tells its compiled functions from those of other kinds (`estimator.compilation.simd.jit_closure`)."""
+        """Suffix of its compiled functions, different for every kind (`estimator.compilation.simd.jit_closure`)."""
         digests = (self.belief_model.digest, self.plant_model.digest if self.plant_model else "replay")
         return "_".join(str(word) for word in (*digests, *self[2:]))
 
@@ -67,7 +69,7 @@ class KernelSpec(NamedTuple):
 
 
 class KernelParams(NamedTuple):
-    """What a kernel is told about an experiment, the same for all environments.
+    """The run-time parameters of a kernel, the same for all environments of an experiment.
 
     Attributes:
         max_input: input of the action 1.
@@ -76,31 +78,32 @@ class KernelParams(NamedTuple):
         iterations: variational iterations per sample.
         step: sampling step [s].
         nominal_parameters: (p,) parameters in the middle of the range, or their means.
-        parameter_stds: (p,) standard deviations of those that are drawn from a Gaussian; minus that of the logarithm of those
-            that are log-normal; 0 for those that are log-uniform.
+        parameter_stds: (p,) a positive number is the standard deviation of a Gaussian parameter, a negative one minus
+            the standard deviation of a log-normal parameter's logarithm, and 0 stands for a log-uniform parameter.
         measurement_noise: (sensors,) standard deviations.
-        walk_variances: (K,) variances of the coefficients' walk in a sample.
-        reward_weights: (4,) of the reward (`duffing_env.rewards.reward_registry.Reward`).
-        terminal: whether a reward is paid at the end.
-        has_terminated_return: whether an episode that is terminated returns ``terminated_return``.
-        terminated_return: return of an episode that is terminated, where it forfeits.
+        walk_variances: (K,) variances of the coefficients' random walk in a sample.
+        reward_weights: (4,) weights of the reward's terms (`duffing_env.rewards.reward_registry.Reward`).
+        terminal: whether the whole reward is paid at the end of the episode.
+        has_terminated_return: whether a terminated episode returns ``terminated_return``.
+        terminated_return: return of a terminated episode.
         prior: (size,) record that episodes start from.
         prior_inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         prior_log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
         hold: samples of an action.
-        max_samples: samples after which an episode is cut off from outside, as Gymnasium's ``TimeLimit`` does.
-        process_noise: standard deviation of what a sample's process noise does to the first sensor.
-        noise_range: largest over smallest of what is drawn for an episode about each of the noises; 1 leaves them.
-        spread: relative half width of the range.
-        budget: of the energy Σ u².
-        max_slew: largest change of the input.
-        sqrt_input_cost: square root of what an input of 1 costs.
-        jump: of the first parameter, in parts of it.
-        has_drift: whether the coefficients are believed to walk.
+        max_samples: samples after which an outer limit truncates an episode, as Gymnasium's ``TimeLimit`` does.
+        process_noise: standard deviation of the effect of one sample's process noise on the first sensor.
+        noise_range: largest over smallest value that an episode draws for each noise; 1 draws no noises.
+        spread: relative half width of the range of log-uniform parameters.
+        budget: largest energy Σ u² of an episode.
+        max_slew: largest change of the input between samples.
+        sqrt_input_cost: square root of the cost of an input of 1.
+        jump: largest relative jump of the first parameter.
+        has_drift: whether the belief lets the coefficients walk at random.
         as_published: whether mean field departs from the paper as its published run did.
         input_delay: samples between a recorded input and the output it acts on.
-        interleaved_envs: environments of a block whose members lie beside each other (`duffing_env.kernel_stages.noise_filter_bank`).
-        hypothesis_priors: (members, 5) shape and rate of γ and of ξ that each of several beliefs starts from, and its weight.
+        interleaved_envs: environments of a block whose members lie side by side
+            (`duffing_env.kernel_stages.noise_filter_bank`).
+        hypothesis_priors: (members, 5) first shape and rate of γ and of ξ of each of several beliefs, and its weight.
     """
 
     max_input: float
@@ -136,12 +139,12 @@ class KernelParams(NamedTuple):
 
 
 def pack_params(params: KernelParams) -> npt.NDArray[np.float64]:
-    """A setup as one array: a compiled function takes that in a tenth of the time that it takes the tuple."""
+    """The parameters as one array: a call of a compiled function takes it in a tenth of a tuple's time."""
     return np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in params])
 
 
 def compile_unpacker(spec: KernelSpec) -> Any:
-    """``unpack(packed)``: the setup again, compiled."""
+    """``unpack(packed)``: the parameters from the array of `pack_params`, compiled."""
     n_sensors, n_parameters = spec.truth_model.n_outputs, len(parameter_names(spec.truth_model))
     sizes = {
         "measurement_noise": n_sensors,
@@ -190,12 +193,12 @@ def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
 
 
 def parameter_names(model: Model) -> tuple[str, ...]:
-    """What is drawn for an episode: the physical parameters, or the coefficients of a model without any."""
+    """Names of the parameters that an episode draws: physical ones, or the coefficients of a model without any."""
     return tuple(model.physical or model.coefficients)
 
 
 def noise_std_rows(model: Model) -> dict[str, str]:
-    """Name of a noise of the plant to the row of its standard deviation: the process noise, then each sensor's."""
+    """Name of each noise of the plant to the row of its standard deviation: process noise first, then the sensors."""
     has_one_sensor = model.n_outputs == 1
     sensors = {
         "measurement_noise" if has_one_sensor else f"measurement_noise_{y}": f"SENSOR_STD_{y}" for y in model.outputs
@@ -204,7 +207,7 @@ def noise_std_rows(model: Model) -> dict[str, str]:
 
 
 def estimated_expressions(model: Model) -> Mapping[str, str]:
-    """What is compared with the truth's parameters: name to its expression in the coefficients."""
+    """Name of each parameter that is compared with the truth, to its expression in the coefficients."""
     return model.physical or {c: c for c in model.coefficients}
 
 
@@ -216,7 +219,7 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     row_of = {name: row for row, name in enumerate(row_of)}
     row_names = [f"Y_{y}" for y in truth.outputs]
     row_names += [f"PARAM_{p}" for p in parameter_names(truth)]
-    row_names += noise_std_rows(truth).values()  # behind the parameters, see `stages.draw_plant_parameters`
+    row_names += noise_std_rows(truth).values()  # behind the parameters, as `draw_plant_parameters` expects
     row_names += [f"X_{x}" for x in truth.states]
     row_names += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
     row_names += [f"PER_{p}" for p in estimated_expressions(belief)]
@@ -247,7 +250,7 @@ def block_offsets(spec: KernelSpec) -> dict[str, int]:
 
 
 def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
-    """Rows of what the paper's model has and the believed one has not, which mean field needs: they hold zeros."""
+    """Rows that mean field needs, but a smaller model than the paper's does not have: they hold zeros."""
     if spec.factorisation != "mean_field":
         return []
     believed_rows = belief_rows(spec.belief_model)
@@ -255,12 +258,12 @@ def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
 
 
 def model_input_rows(spec: KernelSpec, model: Model, row_of: Mapping[str, int]) -> dict[str, int]:
-    """Rows of the input over a sample as a model takes it, ``U_0``, ``U_1``, ...: they stand in rows that are there."""
+    """Rows of a model's input over a sample, ``U_0``, ``U_1``, ...: other names of rows that a block has anyway."""
     if model.is_continuous:
         names = ["INPUT"] if spec.degree == 0 else ["LAST_INPUT", "RISE"]
     elif spec.truth_model.is_continuous and spec.degree == 1:
-        # A difference equation takes the input at the sample before; where the input goes linearly from one action to
-        # the next, that is the last action.
+        # A difference equation takes the input at the sample before: the last action, where the input goes linearly
+        # from one action to the next.
         names = ["LAST_INPUT", "OLDER_INPUT"]
     else:
         names = ["INPUT", "LAST_INPUT", "OLDER_INPUT"]

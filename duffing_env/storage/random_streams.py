@@ -1,7 +1,7 @@
 """Random numbers inside the kernel: one SFC64 stream per environment, started from its ``np_random``.
 
-The stream is NumPy's `numpy.random.SFC64`, bit for bit. Its four 64-bit words lie in the environment's block, as the
-bits of float64 rows, so that a copy of a block is a copy of everything that the future depends on.
+The stream is NumPy's `numpy.random.SFC64`, bit for bit. Its four 64-bit words lie in float64 rows of the environment's
+block, so that a copy of a block also copies the random numbers to come.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _COUNTER_STEP = np.uint64(1)
 _UNIT_52 = 2.0**-52
 
 
-#: Branches of the seeds, by their spawn keys: whatever the seed, a stream of one is no stream of another.
+#: Branches of the seeds with their spawn keys: no two branches share a stream, whatever the seeds.
 SEED_BRANCHES: dict[str, tuple[int, ...]] = {"train": (), "validation": (1,), "test": (2,)}
 
 

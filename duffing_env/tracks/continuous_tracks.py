@@ -1,4 +1,4 @@
-"""The tracks on the differential equation, with noises that nobody knows: version 1 of each."""
+"""The tracks on the differential equation with unknown noises, which are the versions 1."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from estimator.support.argument_checks import check_choice
 
 @dataclass(frozen=True)
 class ContinuousExperiment(SimulatedExperiment):
-    """An experiment on the differential equation; `ContinuousEnv` says what its options are."""
+    """An experiment on the differential equation; `ContinuousEnv` describes its options."""
 
     estimator: str = "ode"
 
@@ -25,7 +25,8 @@ class ContinuousExperiment(SimulatedExperiment):
         super().__post_init__()
         if self.reward == "fisher" and self.estimator != "ode":
             raise ValueError(
-                "reward must not be 'fisher' for estimator='nlarx', whose equation the plant does not obey"
+                "reward must not be 'fisher' for estimator='nlarx', because the plant does not obey its equation; use "
+                "'log_posterior'"
             )
         if self.estimator == "ode" and self.factorisation != "structured":
             raise ValueError(
@@ -45,35 +46,35 @@ class ContinuousExperiment(SimulatedExperiment):
 
 
 class ContinuousEnv(DuffingEnv):
-    r"""The same task on the differential equation itself, sampled, with noises that nobody knows.
+    r"""The same task on the sampled differential equation itself, with unknown noises.
 
     ## Description
 
     The oscillator m x'' + c x' + a x + b x³ = u + w, Eq. (1) of the paper, is a stochastic differential equation: w is
     white noise, and the equation is integrated in eight sub-steps of each sample of 1.6384 ms (Runge and Kutta's method
     of order 4 for the drift, the noise's two integrals drawn jointly). The input is held over a sample, as a converter
-    does. The sensor gives y_{t+1} = x_{t+1} + v. How strong w and v are differs from episode to episode, over a decade
-    each, and neither estimator nor agent is told.
+    does. The sensor measures y_{t+1} = x_{t+1} + v. The strengths of w and v differ from episode to episode, over a
+    decade each, and are unknown to estimator and agent.
 
-    The estimator knows this equation, with time counted in samples,
+    The estimator uses this equation, with time counted in samples,
 
         x'' = g u - d x' - k x - κ x³ + noise,    k = δ² a/m,  κ = δ² b/m,  d = δ c/m,  g = δ²/m,
 
     integrates it with exact sensitivities, and updates a joint Gaussian posterior over (x, x', k, κ, d, g) with every
     sample; seven ratios of the noises at three levels each are weighed by their evidence (``noise_hypotheses``).
-    ``estimator="nlarx"`` puts the paper's difference equation in its place, which this plant does not obey: a
-    foil that shows what misspecification does (docs/continuous.md).
+    ``estimator="nlarx"`` uses the paper's difference equation instead, which this plant does not obey: a foil that
+    shows the effect of misspecification (docs/continuous.md).
 
     ## Action space, observation space
 
     As `DuffingEnv`, with k, κ, d, g in place of θ1, θ2, θ3, η (entries 0 to 13), and E[x], E[x'] as the filtered state
-    (16, 17; x' in V per sample). With ``estimator="nlarx"`` all are those of `DuffingEnv`.
+    (16, 17; x' in V per sample). With ``estimator="nlarx"`` all entries are as in `DuffingEnv`.
 
     ## Reward
 
-    As `DuffingEnv`, with C the posterior covariance of (k, κ, d, g) and c* their true values; the information gained
-    over an episode is about 16 nats. ``fisher`` counts with the true noises. With ``estimator="nlarx"`` there is no
-    ``fisher``, and C and c* are of θ1, θ2, θ3, η: the true ones by Eq. (3), the estimates of m, c, a, b by Eq. (4).
+    As `DuffingEnv`, with C the posterior covariance of (k, κ, d, g) and c* their true values; an episode gains about
+    16 nats of information. ``fisher`` uses the true noises. With ``estimator="nlarx"`` there is no ``fisher``, and C
+    and c* are of θ1, θ2, θ3, η: the true ones by Eq. (3), the estimates of m, c, a, b by Eq. (4).
 
     ## Starting state
 
@@ -85,25 +86,25 @@ class ContinuousEnv(DuffingEnv):
 
     ## Episode end
 
-    - Termination: \|y\| > ``max_output`` (0.6 V), the sensor's limit, as this plant does not blow up; or a number that
-      is not finite (``info["diverged"]``), which leaves the belief as it was before that step.
+    - Termination: \|y\| > ``max_output`` (0.6 V), the sensor's limit (this plant does not blow up); or a number that is
+      not finite (``info["diverged"]``), which leaves the belief as it was before that step.
     - Truncation: after ``horizon`` (256) samples.
 
     ## Information
 
-    As `DuffingEnv`; the truth has ``process_noise`` and ``measurement_noise``, too.
+    As `DuffingEnv`; the truth includes ``process_noise`` and ``measurement_noise``.
 
     ## Arguments
 
-    As `DuffingEnv`, but for:
+    As `DuffingEnv`, except for:
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``estimator`` | ``ode`` | the plant's equation; or ``nlarx``, the paper's |
     | ``factorisation`` | ``structured`` | with ``estimator="nlarx"`` and one hypothesis also ``mean_field`` |
-    | ``process_noise`` | 5e-4 | standard deviation of what a sample's process noise alone does to x [V]: the middle |
+    | ``process_noise`` | 5e-4 | standard deviation of one sample's effect of w on x [V]: the middle of its range |
     | ``measurement_noise`` | 5e-4 | standard deviation of v [V]: the middle of its range |
-    | ``noise_range`` | 10 | largest over smallest of each noise; 1: they are the middle |
+    | ``noise_range`` | 10 | largest over smallest standard deviation of each noise; 1: the middle |
     | ``noise_hypotheses`` | 7 | as `DuffingEnv` |
 
     >>> import gymnasium as gym
@@ -134,7 +135,7 @@ class ContinuousShortEnv(ContinuousEnv):
 
     ## Description
 
-    As `ContinuousEnv` in all, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the
+    As `ContinuousEnv`, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the
     posterior is still wide, and the noises hardly known, when the best inputs must be chosen.
 
     ## Version history
@@ -144,13 +145,12 @@ class ContinuousShortEnv(ContinuousEnv):
 
 
 class ContinuousPowerEnv(ContinuousEnv):
-    """Identify the oscillator of Eq. (1) with an input of at most 22.2 mV RMS, that of the Silverbox multisine.
+    """Identify the oscillator of Eq. (1) with an input of at most 22.2 mV RMS, as the Silverbox multisine has.
 
     ## Description
 
-    As `ContinuousEnv` in all, with the budget of `PowerEnv`: over an episode Σ u² is at most ``horizon * max_rms**2``,
-    with ``max_rms`` 0.0222, and an input that what is left cannot pay for is cut to what it can. Observations 18 and 21
-    are as there.
+    As `ContinuousEnv`, with the budget of `PowerEnv`: over an episode Σ u² is at most ``horizon * max_rms**2``, with
+    ``max_rms`` 0.0222, and an input beyond the rest of the budget is cut. Observations 18 and 21 are as in `PowerEnv`.
 
     ## Version history
 
@@ -159,12 +159,12 @@ class ContinuousPowerEnv(ContinuousEnv):
 
 
 class ContinuousOutputEnv(ContinuousEnv):
-    r"""Identify the oscillator of Eq. (1) without leaving \|y\| ≤ 0.3 V, the range seen on the real circuit.
+    r"""Identify the oscillator of Eq. (1) within \|y\| ≤ 0.3 V, the output range of the real circuit.
 
     ## Description
 
-    As `ContinuousEnv` in all, but ``max_output`` is 0.3: the episode is terminated at half the displacement, in parts
-    of which the states and the output are observed. So the input must feel its way.
+    As `ContinuousEnv`, but ``max_output`` is 0.3: an episode is terminated at half the displacement, which also scales
+    the observed states and output. So the input must be cautious.
 
     ## Version history
 

@@ -1,4 +1,4 @@
-"""The tracks that differ from `DuffingEnv` by their limits, or by an oscillator that changes."""
+"""The tracks on the paper's equation with a short horizon, an input budget, an output limit or a jumping mass."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ class ShortEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv` in all, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the
-    posterior is still wide when the best inputs must be chosen. The information gained over an episode is about 16
-    nats.
+    As `DuffingEnv`, but ``horizon`` is 48, after which an episode is truncated: every sample counts, and the posterior
+    is still wide when the best inputs must be chosen. An episode gains about 16 nats of information.
 
     >>> import gymnasium as gym
     >>> env = gym.make("duffing_env/Short-v0")
@@ -27,17 +26,17 @@ class ShortEnv(DuffingEnv):
 
 
 class PowerEnv(DuffingEnv):
-    """Identify the oscillator with an input of at most 22.2 mV RMS, that of the Silverbox multisine.
+    """Identify the oscillator with an input of at most 22.2 mV RMS, as the Silverbox multisine has.
 
     ## Description
 
-    As `DuffingEnv` in all, but the input has a budget: over an episode its root mean square is at most ``max_rms``, so
-    its energy Σ u² is at most ``horizon * max_rms**2``. An input that what is left of the budget cannot pay for is cut
-    to what it can: |u_t| ≤ sqrt(budget - spent), so the budget is never exceeded, and an input of zero follows when
-    nothing is left. Spent all at once at 0.15 V it lasts for 5 samples; when to spend it is the question.
+    As `DuffingEnv`, but the input has a budget: over an episode its root mean square is at most ``max_rms``, so its
+    energy Σ u² is at most ``horizon * max_rms**2``. An input beyond the rest of the budget is cut,
+    |u_t| ≤ sqrt(budget - spent), so the budget is never exceeded, and the input is zero when nothing is left. Inputs of
+    0.15 V spend it in 5 samples; the task is when to spend it.
 
-    The action is the input that is asked for; observation 18 is the input that was given, observation 21 the part of
-    the energy that is left. ``max_rms`` is 0.0222. The information gained over an episode is 9 to 16 nats.
+    The action is the requested input; observation 18 is the applied input, observation 21 the part of the energy that
+    is left. ``max_rms`` is 0.0222. An episode gains 9 to 16 nats of information.
 
     >>> import gymnasium as gym
     >>> env = gym.make("duffing_env/Power-v0")
@@ -54,13 +53,13 @@ class PowerEnv(DuffingEnv):
 
 
 class OutputEnv(DuffingEnv):
-    r"""Identify the oscillator without leaving \|y\| ≤ 0.3 V, the range seen on the real circuit.
+    r"""Identify the oscillator within \|y\| ≤ 0.3 V, the output range of the real circuit.
 
     ## Description
 
-    As `DuffingEnv` in all, but ``max_output`` is 0.3: the episode is terminated at half the displacement, in parts of
-    which the state and the output are observed. Driven at its resonance by the largest input, the oscillator gets there
-    within a period and a half, so the input must feel its way.
+    As `DuffingEnv`, but ``max_output`` is 0.3: an episode is terminated at half the displacement, which also scales the
+    observed state and output. Driven at resonance by the largest input, the oscillator reaches the limit within a
+    period and a half, so the input must be cautious.
 
     ## Version history
 
@@ -73,27 +72,24 @@ class DriftEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv`, but over a ``horizon`` of 512 samples, and at a sample that is uniform over the middle half of the
-    episode the mass is multiplied by a factor that is log-uniform on 1 ± ``jump`` (0.3; below 1). The estimator
-    expects change: before every sample each coefficient's standard deviation is widened as by a random walk, ``drift``
-    (0.01) of that of the prior, so it forgets in several hundred samples. Its intervals are those of a walk; a jump
-    is a large step of it.
+    As `DuffingEnv`, but over a ``horizon`` of 512 samples, and at a sample uniform over the middle half of the episode
+    the mass is multiplied by a factor log-uniform on 1 ± ``jump`` (0.3; below 1). The estimator expects change: before
+    every sample a random walk widens each coefficient's posterior, by a standard deviation of ``drift`` (0.01) times
+    the prior's, so it forgets in several hundred samples. Its intervals hold for a walk; a jump is a large step of it.
 
-    The agent is not told of the jump; it shows in the outputs. At the end ``env.unwrapped.truth`` is the oscillator
-    after it. All that is not said here is as in `DuffingEnv`.
+    Only the outputs show the jump to the agent. At the end ``env.unwrapped.truth`` is the oscillator after the jump.
 
     ## Reward
 
-    The posterior widens between samples, so the ``information_gain`` of a step can be negative;
-    ``log_posterior`` and ``parameter_error`` are those of the oscillator as it is at that sample, and what the jump
-    itself does to them is not counted: they are set anew with the new mass. So they pay again for what was believed
-    and has to be unlearned, the more the surer it was, and are no rewards to train with here. Of ``information_gain``
-    only what is known at the end is left over an episode; with ``terminated_return=0`` nothing is gained by ending it
-    before the jump.
+    The posterior widens between samples, so the ``information_gain`` of a step can be negative; its sum over an episode
+    is the knowledge at the end. ``log_posterior`` and ``parameter_error`` refer to the oscillator at that sample and do
+    not count their change by the jump itself. So they pay again for every belief that has to be unlearned, the more the
+    surer it was, and are no rewards to train with here. With ``terminated_return=0`` an end before the jump gains
+    nothing.
 
     ## Policies
 
-    What they gain, on 128 systems of the branch ``test``. Training has the command, and more.
+    Gains on 128 systems of the branch ``test``; the page Training has the command, and more.
 
     | policy | ``information_gain`` / nat |
     |---|---|

@@ -24,7 +24,7 @@ from estimator.support.array_types import FloatArray
 
 @dataclass(frozen=True)
 class ModelExperiment(SimulatedExperiment):
-    """An experiment on any model, which is believed as it is; `ModelEnv` says what its options are."""
+    """An experiment on any model, which is plant and belief at once; `ModelEnv` describes its options."""
 
     system: str | Model | Mapping[str, Any] = "difference"
     mean: Mapping[str, float] | None = None
@@ -33,7 +33,7 @@ class ModelExperiment(SimulatedExperiment):
     interpolation: str = "zero_order"
     sensor_noise: tuple[float, ...] | None = None
 
-    #: A model may bend more than can be followed to first order.
+    #: A model may be too nonlinear for a linearised update.
     uses_cubature: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -46,7 +46,8 @@ class ModelExperiment(SimulatedExperiment):
             check_number(f"std of {parameter}", value)
         if self.std is not None and self.plant_spread not in (None, 0):
             raise ValueError(
-                f"plant_spread must be 0 or left out where std says how plants are drawn, but is {self.plant_spread!r}"
+                f"plant_spread must be 0 or left out where std gives the range of the plants, but is "
+                f"{self.plant_spread!r}"
             )
         check_number("sampling_step", self.sampling_step)
         check_choice("interpolation", self.interpolation, ("zero_order", "linear"))
@@ -83,7 +84,7 @@ class ModelExperiment(SimulatedExperiment):
 
     @property
     def degree(self) -> int:
-        """Of the input over a sample."""
+        """Degree of the input over a sample."""
         return int(self.interpolation == "linear" and self.plant.is_continuous)
 
     @property
@@ -110,7 +111,7 @@ class ModelExperiment(SimulatedExperiment):
         return [first, *(self.sensor_noise or [first] * (self.plant.n_outputs - 1))]
 
     def prior_for_model(self, model: Model, factorisation: str = "structured") -> Belief:
-        """The prior of plants so drawn."""
+        """The prior that fits the range of the plants."""
         process, first = self.prior_noise_stds
         sensors = [first / self.measurement_noise * std for std in self.noises]  # all as far off as the first
         return weak_prior(
@@ -118,7 +119,7 @@ class ModelExperiment(SimulatedExperiment):
         )
 
     def coefficient_moments(self, model: Model) -> tuple[FloatArray, FloatArray]:
-        """Mean (K,) and covariance (K, K) of the coefficients of plants so drawn."""
+        """Mean (K,) and covariance (K, K) of the coefficients over the range of the plants."""
         if self.std is None:
             return super().coefficient_moments(model)
         return gaussian_moments(model, self.nominal_parameters, self.std, self.scales)
@@ -138,9 +139,8 @@ class ModelEnv(DuffingEnv):
 
     ## Description
 
-    As `DuffingEnv`, but the plant is a `estimator.models.model.Model`: the environment steps it with its noises, and
-    the estimator that is made of the same declaration keeps the posterior that is observed. Actions, rewards and all
-    that is not said here are as there.
+    As `DuffingEnv`, but the plant is an `estimator.models.model.Model`: the environment simulates it with its noises,
+    and an estimator made from the same declaration keeps the observed posterior.
 
     ## Observation space
 
@@ -152,7 +152,7 @@ class ModelEnv(DuffingEnv):
 
     ## Starting state
 
-    A plant drawn as ``mean``, ``std`` and ``spread`` say, at rest; the prior is that of plants so drawn.
+    A plant at rest, drawn by ``mean``, ``std`` and ``spread``; the prior fits this range of plants.
 
     ## Episode end
 
@@ -161,28 +161,30 @@ class ModelEnv(DuffingEnv):
 
     ## Belief
 
-    The estimator follows the model to first order. Where a model bends more than that, its intervals are too narrow:
-    of ``WienerHammerstein-v0`` those of 90 % hold 68 to 84 % under binary inputs at the limit. With
-    ``noise_hypotheses`` above 1 it moves sigma points, and they hold 87 to 90 % (docs/coverage.md).
+    The estimator linearises the model. For a strongly nonlinear model its intervals are too narrow: on
+    ``WienerHammerstein-v0`` the 90 % intervals contain the truth in 68 to 84 % of cases, under binary inputs at the
+    limit. With ``noise_hypotheses`` above 1 it propagates sigma points, and they contain it in 87 to 90 %
+    (docs/coverage.md).
 
     ## Information
 
-    Where noises are drawn (``noise_range``), of several sensors ``truth`` has ``measurement_noise_<sensor>``.
+    Where noises are drawn (``noise_range``) and there are several sensors, ``truth`` has
+    ``measurement_noise_<sensor>``.
 
     ## Arguments
 
-    Those of `DuffingEnv`, and the following. With ``measurement_noise_guess`` the priors of further sensors are as far
-    off as that of the first.
+    As `DuffingEnv`, and the following. With ``measurement_noise_guess`` the priors of all sensors are wrong by the same
+    factor.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields |
     | ``mean`` | | parameter to its mean, or without ``std`` to the middle of its range |
     | ``std`` | None | parameter to its standard deviation: Gaussian; None: log-uniform within ``spread`` |
-    | ``plant_spread`` | ``spread`` | as there; with ``std`` it may only be 0 |
+    | ``plant_spread`` | ``spread`` | as in `DuffingEnv`; with ``std`` it may only be 0 |
     | ``sampling_step`` | 1 | seconds between two samples |
     | ``interpolation`` | ``zero_order`` | or ``linear``: the input of a differential equation between samples |
-    | ``sensor_noise`` | None | standard deviations of the further sensors; None: that of the first |
+    | ``sensor_noise`` | None | standard deviations of the further sensors; None: the first sensor's |
 
     >>> import gymnasium as gym
     >>> import duffing_env

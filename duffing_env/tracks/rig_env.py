@@ -1,4 +1,4 @@
-"""A rig as the environment: simulated, or around the plant itself."""
+"""A rig as an environment: simulated from the rig's guess, or around a real plant."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from estimator.support.array_types import FloatArray
 
 @dataclass(frozen=True)
 class RigExperiment(RigScaling, SimulatedExperiment):
-    """An experiment on oscillators that are drawn from a rig's guess. All numbers are in parts of its limit and range.
+    """An experiment on oscillators drawn from a rig's guess. All numbers are in parts of the rig's limit and range.
 
-    `RigEnv` says what its options are; ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior`` are refused,
-    because the guess says what may be.
+    `RigEnv` describes its options; ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior`` are refused, because
+    the guess gives the range.
     """
 
     rig: RigLike | None = None
@@ -51,26 +51,26 @@ class RigExperiment(RigScaling, SimulatedExperiment):
         self._check_fractions()
         for name, usual in (("spread", 0.3), ("plant_spread", None), ("jump", 0.0), ("mean", None), ("prior", None)):
             if getattr(self, name) != usual:
-                raise ValueError(f"{name} must be left out for a rig, whose guess says the range")
+                raise ValueError(f"{name} must be left out for a rig, whose guess gives the range")
 
     @property
     def plant(self) -> Model:
-        """Eq. (1) with offsets, as the rig's sensor shows it."""
+        """Eq. (1) with offsets, measured by the rig's sensor."""
         return self.validated_rig.model
 
     @property
     def model(self) -> Model:
-        """The plant's own."""
+        """The plant's model."""
         return self.plant
 
     @property
     def nominal_parameters(self) -> dict[str, float]:
-        """The guess's middle, inside."""
+        """The middle of the guess, in internal units."""
         return {name: mean for name, (mean, _) in self._parameter_moments.items()}
 
     @cached_property
     def _parameter_moments(self) -> dict[str, tuple[float, float]]:
-        """Parameter to middle and standard deviation, inside; of m, which is log-normal, minus its logarithm's."""
+        """Parameter to middle and standard deviation, in internal units; of the log-normal m, minus its logarithm's."""
         rig, model, scales = self.validated_rig, self.plant, self.scales
         assert rig.guess is not None
         outside = {
@@ -91,14 +91,14 @@ class RigExperiment(RigScaling, SimulatedExperiment):
 
     @cached_property
     def prior_belief(self) -> Belief:
-        """The prior that the guess makes, with the noises where they are guessed to be."""
+        """The prior from the guess, with the noise priors at the guessed noises."""
         prior, (process, sensor) = rig_prior(self.validated_rig), self.prior_noise_stds
         process_std, shape = _process_noise_std(process, prior.coefficients()["gain"][0]), float(self.noise_shape)
         gamma, xi = ((shape, shape * std**2) for std in (process_std, sensor))
         return Belief.of(prior.model, prior.mean, prior.cov, gamma, xi, scales=prior.scales)
 
     def prior_for_model(self, model: Model, factorisation: str = "structured") -> Belief:
-        """The prior of the rig's model; there is no other that knows its offsets.
+        """The prior of the rig's model; no other model has the rig's offsets.
 
         Raises:
             ValueError: for another model.
@@ -109,7 +109,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
 
     @property
     def plant_params(self) -> dict[str, Any]:
-        """The noises and the range of the plants, inside."""
+        """The noises and the range of the plants, in internal units."""
         plant_fields, gain = super().plant_params, self.prior_belief.coefficients()["gain"][0]
         stds: FloatArray = np.array([std for _, std in self._parameter_moments.values()])
         return {
@@ -120,23 +120,22 @@ class RigExperiment(RigScaling, SimulatedExperiment):
 
 
 def _process_noise_std(disturbance: float, gain: float) -> float:
-    """σ_w of a disturbance of the force (`estimator.rigs.rig_prior`)."""
+    """Standard deviation σ_w of the process noise from a disturbance of the force (`estimator.rigs.rig_prior`)."""
     return float(disturbance * gain / np.sqrt(3))
 
 
 class RigEnv(DuffingEnv):
-    r"""Choose the input of an oscillator of one's own so that its parameters are identified.
+    r"""Choose the input of an oscillator on a given rig so that its parameters are identified.
 
     ## Description
 
-    A `estimator.Rig` says how an oscillator m x'' + c x' + a x + b x³ = u + w stands in the world: sampling step,
-    units, the limit of the input, the range and kind of the sensor, and what is guessed of m, c, a and b. The
-    environment draws oscillators from the guess, with offsets of input and output and noises that neither estimator nor
-    policy is told, and steps them with the differential equation. With ``plant=`` the plant itself takes their place
-    (`duffing_env.tracks.rig_plant_env`).
+    An `estimator.Rig` describes the set-up of an oscillator m x'' + c x' + a x + b x³ = u + w: sampling step, units,
+    limit of the input, range and kind of the sensor, and a guess of m, c, a and b. The environment draws oscillators
+    from the guess, with offsets of input and output and noises unknown to estimator and policy, and simulates the
+    differential equation. ``plant=`` replaces the simulation by a real plant (`duffing_env.tracks.rig_plant_env`).
 
-    Inside, everything is in parts of the input's limit and the output's range; ``belief`` and ``truth`` are in the
-    rig's units.
+    Internal numbers are in parts of the input's limit and the output's range; ``belief`` and ``truth`` are in the rig's
+    units.
 
     ## Action space
 
@@ -151,13 +150,13 @@ class RigEnv(DuffingEnv):
 
     ## Reward
 
-    As `DuffingEnv`; with ``plant=`` those that do not need the truth.
+    As `DuffingEnv`; with ``plant=`` only the rewards that do not need the truth.
 
     ## Starting state
 
-    Simulated: m is drawn log-normally, c, a and b from a Gaussian whose central 90 % are the guess (those that are
-    guessed to have one sign keep it), offsets of 3 % and noises over a decade; the oscillator is at rest. With
-    ``plant=``: what ``plant.reset()`` leaves.
+    Simulated: m is drawn log-normally, c, a and b from a Gaussian whose central 90 % are the guess (a parameter with
+    one sign in the guess keeps it), offsets of 3 % and noises over a decade; the oscillator is at rest. With
+    ``plant=``: the state after ``plant.reset()``.
 
     ## Episode end
 
@@ -170,17 +169,17 @@ class RigEnv(DuffingEnv):
 
     ## Arguments
 
-    Those of `DuffingEnv` but for ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior``, and:
+    As `DuffingEnv` except for ``spread``, ``plant_spread``, ``jump``, ``mean`` and ``prior``, and:
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``rig`` | | a `Rig`, a dictionary (which is JSON-able), or the name of a rig file; with limit, range and guess |
-    | ``plant`` | None | the plant itself: an object with ``reset()`` and ``step(u)``, in the rig's units |
+    | ``plant`` | None | a real plant: an object with ``reset()`` and ``step(u)``, in the rig's units |
     | ``max_input`` | 1 | input of the action 1, in parts of the rig's limit; at most 1 |
     | ``max_output`` | 1 | largest output, in parts of the rig's range; at most 1 |
     | ``process_noise`` | the rig's, or 0.001 | disturbance of the force in a sample, in parts of the input's limit |
     | ``measurement_noise`` | the rig's, or 0.001 | noise of the sensor, in parts of the output's range |
-    | ``noise_range`` | 10 | both are drawn for every episode, over a range of this factor |
+    | ``noise_range`` | 10 | factor over which both noises are drawn for every episode |
     | ``noise_hypotheses`` | (5, 5), or (7, 7) with ``plant`` | values of each noise that the estimator weighs |
 
     >>> import gymnasium as gym
@@ -210,7 +209,7 @@ class RigEnv(DuffingEnv):
     _plant: ClassVar[None] = None
 
     def __new__(cls, plant: Plant | None = None, **options: Any) -> Any:
-        """Itself; or, around a plant, a `RigPlantEnv`."""
+        """A `RigEnv`, or around a plant a `RigPlantEnv`."""
         return super().__new__(cls) if plant is None else RigPlantEnv(plant, **options)
 
 

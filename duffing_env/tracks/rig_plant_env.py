@@ -1,4 +1,4 @@
-"""A rig around the plant itself: an object that takes inputs and gives outputs in the rig's units."""
+"""An environment around a real plant on a rig: an object that takes inputs and gives outputs in the rig's units."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from estimator.support.argument_checks import check_integer, short_repr
 
 RigLike = Rig | Mapping[str, Any] | str | Path
 
-#: How several plants are played.
+#: Remedy for several environments around one plant, or several plants in one environment.
 ONE_PLANT_MESSAGE = (
     "one plant is one environment; for several use "
     "gymnasium.vector.SyncVectorEnv([lambda: gym.make('duffing_env/Rig-v0', rig=rig, plant=plant_1), ...])"
@@ -36,13 +36,13 @@ ONE_PLANT_MESSAGE = (
 
 
 class Plant(Protocol):
-    """What a plant is: a simulator, a circuit behind a converter, a process behind a socket."""
+    """The methods of a plant: of a simulator, a circuit behind a converter, or a process behind a socket."""
 
     def reset(self) -> object:
-        """Bring the plant to rest, with no input; what is returned is not looked at."""
+        """Bring the plant to rest, without input; the returned object is ignored."""
 
     def step(self, u: float) -> SupportsFloat | npt.NDArray[Any]:
-        """Apply the input u for one sampling step, and give the output at its end, both in the rig's units.
+        """Apply the input u for one sampling step, and return the output at its end, both in the rig's units.
 
         The output is one number, or an array that holds one.
         """
@@ -50,14 +50,14 @@ class Plant(Protocol):
 
 
 def playable_rig(rig: RigLike | None, needs_guess: bool = True) -> Rig:
-    """The rig of an environment.
+    """The rig of an environment, checked.
 
-    An input that a generator smooths between samples (``look_ahead``, ``spline``) cannot be known sample by sample: an
-    environment's goes linearly from one to the next instead.
+    The interpolations ``look_ahead`` and ``spline`` depend on later inputs: in an environment the input goes linearly
+    from one sample to the next instead.
 
     Raises:
-        ValueError: for none, one without limit, range or guess, one with a delay, or one whose motion is guessed but
-            whose sensor stands so far off that its range says nothing of the motion.
+        ValueError: for no rig; for a rig without limit, range or guess; for a rig with a delay; and where the motion is
+            guessed by a sensor whose offset exceeds half of its range.
     """
     if rig is None:
         raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
@@ -74,20 +74,20 @@ def playable_rig(rig: RigLike | None, needs_guess: bool = True) -> Rig:
     assert sensor.range is not None
     if needs_guess and sensor.kind == "displacement" and abs(sensor.offset) > sensor.range / 2:
         raise ValueError(
-            f"output.offset must be within half of the range, which the motion is guessed by, but is {sensor.offset:g} "
+            f"output.offset must be within half of the range, by which the motion is guessed, but is {sensor.offset:g} "
             f"of {sensor.range:g} {sensor.unit}; subtract it from the output, and give the range of the motion"
         )
     return rig
 
 
 class RigScaling:
-    """What experiments on a rig share."""
+    """The limits, units and sampling step of experiments on a rig."""
 
     rig: RigLike | None
     max_input: float
     max_output: float
 
-    #: A guess is wide.
+    #: The guess makes a wide prior.
     uses_cubature: ClassVar[bool] = True
 
     def _check_fractions(self) -> None:
@@ -97,35 +97,35 @@ class RigScaling:
 
     @property
     def validated_rig(self) -> Rig:
-        """The rig."""
+        """The option ``rig``, once it is checked."""
         assert isinstance(self.rig, Rig)
         return self.rig
 
     @property
     def degree(self) -> int:
-        """Of the input over a sample: held, or linear from the last to this one."""
+        """Degree of the input over a sample: 0 held, 1 linear from the last input on."""
         return int(self.validated_rig.interpolation != "zero_order")
 
     @property
     def step(self) -> float:
-        """The rig's."""
+        """The rig's sampling step [s]."""
         return float(self.validated_rig.step)
 
     @property
     def scales(self) -> Scales:
-        """The rig's."""
+        """The rig's factors from internal to physical units."""
         return self.validated_rig.scales
 
 
 @dataclass(frozen=True)
 class RigPlantExperiment(RigScaling, Experiment):
-    """An experiment on a rig's plant itself, whose parameters nobody knows.
+    """An experiment on a rig's real plant, whose parameters are unknown.
 
-    `duffing_env.tracks.rig_env.RigEnv` says what its options are. Seven values of each noise reach over three decades.
+    `duffing_env.tracks.rig_env.RigEnv` describes its options. Seven values of each noise span three decades.
 
     Attributes:
-        prior: the belief that every episode starts from, in the rig's scales; what the guess says where it is None.
-            With one the rig needs no guess. The state of an oscillator's does not count.
+        prior: the belief that every episode starts from, in the rig's scales; None: the prior from the rig's guess.
+            With a prior the rig needs no guess. The state of the prior is replaced by rest.
     """
 
     rig: RigLike | None = None
@@ -141,7 +141,7 @@ class RigPlantExperiment(RigScaling, Experiment):
         object.__setattr__(self, "rig", playable_rig(self.rig, self.prior is None))
         if self.prior is not None:
             check_prior(self.prior, self.scales)
-        # A posterior's state is that of the end of its record, and the plant is brought to rest.
+        # A posterior has the state at the end of its record, but the plant is brought to rest.
         prior = rig_prior(self.validated_rig) if self.prior is None else reset_state(self.prior)
         object.__setattr__(self, "prior", prior)
         super().__post_init__()
@@ -149,11 +149,14 @@ class RigPlantExperiment(RigScaling, Experiment):
         check_integer("horizon", self.horizon, MAX_SAMPLES)
         if kernel_reward(self.reward).needs_truth:
             raise ValueError(
-                f"reward must not be {self.reward!r} for a plant of one's own, whose true oscillator nobody knows; "
-                "use 'information_gain', 'expected_free_energy' or 'free_energy'"
+                f"reward must not be {self.reward!r} for a real plant, whose true parameters are unknown; use "
+                "'information_gain', 'expected_free_energy' or 'free_energy'"
             )
         if self.observation == "privileged":
-            raise ValueError("observation must not be 'privileged' for a plant of one's own, whose truth nobody knows")
+            raise ValueError(
+                "observation must not be 'privileged' for a real plant, whose true parameters are unknown; use "
+                "'posterior' or 'history'"
+            )
         if self.model.n_outputs != 1:
             raise ValueError(
                 f"prior must be of a model with one sensor, but {self.model.name!r} has {self.model.n_outputs}; "
@@ -167,17 +170,17 @@ class RigPlantExperiment(RigScaling, Experiment):
 
     @property
     def likeliest_log_noise_ratio(self) -> float | None:
-        """That of the prior, where each noise is unknown by itself."""
+        """The noise ratio of the prior, where both noises are unknown independently."""
         return equal_effect_log_ratio(self.prior_belief) if isinstance(self.noise_hypotheses, tuple) else None
 
     @property
     def model(self) -> Model:
-        """That of the prior."""
+        """The model of the prior."""
         return self.prior_belief.model
 
     @property
     def nominal_parameters(self) -> dict[str, float]:
-        """What the prior believes, inside: nobody knows the plant."""
+        """The means of the prior, in internal units, in place of the unknown true parameters."""
         dimensions = self.model.dimensions
         parameters = self.prior_belief.parameters()
         return {
@@ -186,34 +189,33 @@ class RigPlantExperiment(RigScaling, Experiment):
 
     @cached_property
     def prior_belief(self) -> Belief:
-        """The prior."""
+        """The option ``prior``, or the prior from the rig's guess."""
         assert self.prior is not None
         return self.prior
 
 
 class RigPlantEnv(DuffingEnv):
-    r"""A rig around its plant; what ``Rig-v0`` is with ``plant=``.
+    r"""An environment around a rig's real plant: ``Rig-v0`` with ``plant=``.
 
-    What the plant gets is what the estimator is told: the action in float32, clipped to [-1, 1], times ``max_input``
-    and the rig's limit. ``step`` has to keep the time: it returns when the sample is there. Nothing is applied between
-    two calls of the environment's ``step``, and nothing after the end of an episode until ``reset``: that of the plant
-    must switch its input off. The compiled step is ready before the plant is first touched. With ``hold`` the plant's
+    Plant and estimator get the same input: the action in float32, clipped to [-1, 1], times ``max_input`` and the rig's
+    limit. The plant's ``step`` keeps the time: it returns when the sample is measured. The environment applies nothing
+    between two calls of its ``step``, and nothing after the end of an episode until ``reset``, so the plant's ``reset``
+    must switch the input off. The compiled step is ready before the first call of the plant. With ``hold`` the plant's
     ``step`` is called for every sample, with the same input.
 
-    Rewards that compare with the true oscillator are refused, because nobody knows it: there is no
-    ``log_posterior_gain`` in the info, and ``env.unwrapped.truth`` raises AttributeError. A plant that raises an
-    exception or gives something that is not a finite number ends the episode (``info["diverged"]``), and leaves the
-    belief as it was before that step. Where it raised, or gave what is no number at all, there is a warning, too, and
-    ``env.unwrapped.plant_error`` is the exception's type and message until the next reset; otherwise it is None, also
-    after NaN. An exception in ``plant.reset()`` comes out of ``reset``, and no episode has begun.
+    Rewards that need the truth are refused, because the true parameters are unknown: the info has no
+    ``log_posterior_gain``, and ``env.unwrapped.truth`` raises AttributeError. If the plant raises an exception or
+    returns no finite number, the episode ends (``info["diverged"]``), and the belief stays as it was before that step.
+    After an exception, or a return value that is no number at all, there is also a warning, and
+    ``env.unwrapped.plant_error`` holds the exception's type and message until the next reset; otherwise it is None,
+    also after NaN. An exception in ``plant.reset()`` propagates from ``reset``, and no episode has begun.
 
-    A plant and a prior are Python objects, so the specification of an environment made with them is not JSON-able; and
-    an environment is copied and pickled with its plant, if the plant can be. One plant is one environment: that which
-    reset it last. Another one around it, whose episode was still going on, raises ``ResetNeeded`` in ``step``, and the
-    plant gets nothing.
+    A plant and a prior are Python objects, so JSON cannot hold the specification of an environment made with them. An
+    environment is copied and pickled with its plant, if the plant can be. A plant belongs to the environment that reset
+    it last: ``step`` of another environment around it raises ``ResetNeeded``, and the plant gets no input.
 
     Args:
-        plant: it stays the caller's, who closes it.
+        plant: the plant, which the caller closes.
         render_mode: as `DuffingEnv`.
         options: fields of `RigPlantExperiment`.
     """
@@ -235,22 +237,22 @@ class RigPlantEnv(DuffingEnv):
         super().__init__(render_mode=render_mode, **options)
         self.plant = plant
         self.plant_error: str | None = None
-        # A plant would wait for the compiler with its first input on.
+        # Compile now: a plant would otherwise keep its first input on while the compiler runs.
         self._batch.step(0.0)
 
     @property
     def truth(self) -> Parameters:
-        """The plant's true parameters are not known.
+        """The plant's true parameters are unknown.
 
         Raises:
             AttributeError: always.
         """
-        raise AttributeError("nobody knows the true parameters of a plant of one's own; ask for env.unwrapped.belief")
+        raise AttributeError("the true parameters of a real plant are unknown; use env.unwrapped.belief")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant is not told the seed."""
+        """Bring the plant to rest and start an episode; ``options`` has no keys, and the plant gets no seed."""
         return super().reset(seed=seed, options=options)
 
     def _reset_plant(self) -> None:
@@ -267,7 +269,7 @@ class RigPlantEnv(DuffingEnv):
         u = self.max_input * float(np.float32(action))
         try:
             y = as_number("step", self.plant.step(scales.input * u)) / scales.output
-        except Exception as error:  # whatever it is: the episode ends in order, and its belief is told
+        except Exception as error:  # any error ends the episode in order, with its belief
             self.plant_error = f"{type(error).__name__}: {error}"
             logger.warn(f"plant.step failed, which ends the episode: {self.plant_error}")
             y = np.nan
@@ -276,10 +278,10 @@ class RigPlantEnv(DuffingEnv):
 
 
 def as_number(method_name: str, value: Any) -> float:
-    """The number that a method of a plant gave.
+    """The return value of a plant's method as a number.
 
     Raises:
-        TypeError: for what is neither a number nor an array that holds one.
+        TypeError: for anything but a number or an array that holds one.
     """
     try:
         number = value.item() if isinstance(value, np.ndarray) else value

@@ -1,4 +1,4 @@
-"""The recorded Silverbox experiment, where a record takes the place of the plant: `SilverboxReplayEnv`."""
+"""The recorded Silverbox experiment as an environment, in which a record replaces the plant: `SilverboxReplayEnv`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from estimator.priors import paper_text_prior, published_run_prior, silverbox_pr
 from estimator.support.argument_checks import check_bool
 from estimator.support.array_types import FloatArray
 
-#: Name of a prior to what makes it of a model.
+#: Name of a prior to the function that makes it for a model.
 _PRIOR_FACTORIES: dict[str, Callable[[Model], Belief]] = {
     "silverbox_twin": silverbox_prior,
     "published_run": partial(published_run_prior, True),
@@ -32,7 +32,7 @@ _PRIOR_FACTORIES: dict[str, Callable[[Model], Belief]] = {
 
 @dataclass(frozen=True)
 class ReplayExperiment(Experiment):
-    """The recorded Silverbox experiment; `SilverboxReplayEnv` says what its options are."""
+    """The recorded Silverbox experiment; `SilverboxReplayEnv` describes its options."""
 
     regime: str = "multisine"
     prior: str = "silverbox_twin"
@@ -54,7 +54,9 @@ class ReplayExperiment(Experiment):
         if self.hold != 1:
             raise ValueError(f"hold must be 1 for a record, which answers sample by sample, but is {self.hold}")
         if self.reward == "fisher":
-            raise ValueError("reward must not be 'fisher' for a record, whose true oscillator nobody knows")
+            raise ValueError(
+                "reward must not be 'fisher' for a record, whose true oscillator is unknown; use 'log_posterior'"
+            )
         if self.as_published and self.factorisation != "mean_field":
             raise ValueError(
                 f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"
@@ -82,7 +84,7 @@ class ReplayExperiment(Experiment):
 
     @cached_property
     def prior_belief(self) -> Belief:
-        """The prior of that name."""
+        """The prior with the name in the option ``prior``."""
         return _PRIOR_FACTORIES[self.prior](self.model).with_factorisation(self.factorisation)
 
     @property
@@ -97,7 +99,7 @@ class ReplayExperiment(Experiment):
 
     @property
     def plant_params(self) -> dict[str, Any]:
-        """How the record is played, and how the estimator departs from the model."""
+        """The delay of the record's input, and whether mean field follows the published run."""
         return {"as_published": self.as_published, "input_delay": self.input_delay}
 
 
@@ -106,14 +108,14 @@ class SilverboxReplayEnv(DuffingEnv):
 
     ## Description
 
-    The record of the Silverbox circuit (Wigren and Schoukens 2013) takes the place of the plant. A record can only
-    answer the input that was applied: an action further than float32 rounding from the recorded input ends the
-    episode, flagged ``off_record``. Otherwise the recorded float64 input and output are what the estimator gets.
-    The reference policies ``silverbox-multisine`` and ``silverbox-arrow`` of `agents` play the record.
+    The record of the Silverbox circuit (Wigren and Schoukens 2013) replaces the plant. A record has outputs for the
+    recorded inputs only: an action further than float32 rounding from the recorded input ends the episode, flagged
+    ``off_record``. Otherwise the estimator gets the recorded float64 input and output. The reference policies
+    ``silverbox-multisine`` and ``silverbox-arrow`` of `agents` play the record.
 
     ## Action space, observation space, reward
 
-    As `DuffingEnv`. The true parameters of a circuit are not known: ``log_posterior``, ``parameter_error`` and
+    As `DuffingEnv`. The true parameters of a circuit are unknown: ``log_posterior``, ``parameter_error`` and
     ``simulation_error`` are relative to its twin, identified from the whole training part.
 
     ## Starting state
@@ -132,20 +134,20 @@ class SilverboxReplayEnv(DuffingEnv):
     ## Arguments
 
     ``factorisation``, ``iterations``, ``noise_hypotheses``, ``reward``, ``terminal``, ``terminated_return``,
-    ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is answered sample
+    ``max_input``, ``max_output`` and ``render_mode`` as `DuffingEnv`. There is no ``hold``: a record is played sample
     by sample.
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
     | ``regime`` | ``multisine`` | the paper's training part, or ``arrow``, its validation part |
     | ``prior`` | ``silverbox_twin`` | or ``published_run``, ``paper_text`` |
-    | ``input_delay`` | 1 | samples between an input and the output it acts on: as Eq. (2) says; 0 as published |
+    | ``input_delay`` | 1 | samples between an input and the output it acts on: 1 as in Eq. (2); 0 as published |
     | ``nonlinear`` | True | whether the estimator's model has the cubic term |
     | ``as_published`` | False | mean field with the two departures of the published run |
     | ``data`` | None | file or folder of the record; searched for where None |
 
     Raises:
-        duffing_env.plants.silverbox_record.RecordNotFound: saying where to get the record and where to put it.
+        duffing_env.plants.silverbox_record.RecordNotFound: with the source of the record, and the folder to put it in.
 
     ## Version history
 
@@ -155,7 +157,7 @@ class SilverboxReplayEnv(DuffingEnv):
     experiment_class: ClassVar[type[Experiment]] = ReplayExperiment
     _info_flags: ClassVar[tuple[str, ...]] = ("diverged", "off_record")
 
-    #: The inputs that the record can answer, in order [V].
+    #: The inputs of the record, in order [V].
     recorded_input = ReadOnlyOption("recorded_input", "experiment.recorded_input")
 
 

@@ -1,4 +1,4 @@
-"""The registered environments. Importing `duffing_env` registers them; it is light, as every worker process does so."""
+"""The registered environments (tracks) with their options. Importing `duffing_env` registers them, which is fast."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any
 
 from estimator.models.pendulum import PENDULUM_SAMPLING_STEP
 
-#: Limits of the Duffing oscillator's tracks, where they have no others.
+#: Default limits of the Duffing oscillator's tracks.
 _DUFFING_LIMITS = {"horizon": 256, "max_input": 0.15, "max_output": 0.6}
 
-#: On Eq. (1) the noises are drawn for every episode, over a decade each, and known to nobody.
+#: On Eq. (1) both noises are drawn for every episode, over a decade each, and neither agent nor estimator gets them.
 _UNKNOWN_NOISES = {"noise_range": 10.0, "noise_hypotheses": 7}
 
-#: The pendulum of IO-SMC²: angle and velocity are seen without noise (here 1 µrad), every 0.05 s.
+#: The pendulum of IO-SMC²: angle and velocity are measured without noise (here 1 µrad), every 0.05 s.
 _PENDULUM_OPTIONS = {
     "mean": {"p1": 14.7, "p2": 0.0, "p3": 3.0},
     "std": {"p1": 0.1**0.5, "p2": 0.1, "p3": 0.1**0.5},
@@ -25,7 +25,7 @@ _PENDULUM_OPTIONS = {
 
 
 def _registration(entry_point: str, vector_entry_point: str, **kwargs: Any) -> dict[str, Any]:
-    """What a track is registered with."""
+    """The keyword arguments with which a track is registered."""
     entry_points = {
         "entry_point": f"duffing_env.{entry_point}",
         "vector_entry_point": f"duffing_env.{vector_entry_point}",
@@ -34,12 +34,12 @@ def _registration(entry_point: str, vector_entry_point: str, **kwargs: Any) -> d
 
 
 def _difference_track(entry_point: str, **overrides: Any) -> dict[str, Any]:
-    """A track on the paper's equation, with what differs from Amplitude-v0."""
+    """A track on the paper's equation, with the options that differ from Amplitude-v0."""
     return _registration(entry_point, "vector_env:DuffingVectorEnv", **{**_DUFFING_LIMITS, **overrides})
 
 
 def _continuous_track(env_class: str, **overrides: Any) -> dict[str, Any]:
-    """A track on the differential equation, with what differs from Amplitude-v1."""
+    """A track on the differential equation, with the options that differ from Amplitude-v1."""
     vector_entry_point = "tracks.continuous_tracks:ContinuousVectorEnv"
     return _registration(
         f"tracks.continuous_tracks:{env_class}",
@@ -53,8 +53,8 @@ def _model_track(system: str, **kwargs: Any) -> dict[str, Any]:
     return _registration("tracks.model_env:ModelEnv", "tracks.model_env:ModelVectorEnv", system=system, **kwargs)
 
 
-#: Id of a track to what it is registered with. Any change of numbers or spaces is a new version. None registers
-#: ``max_episode_steps``: its time limit would cut a longer ``horizon`` short (`duffing_env.env_base.ExperimentEnv`).
+#: Id of a track to its registration. Any change of numbers or spaces is a new version. No track registers
+#: ``max_episode_steps``: its time limit would truncate a longer ``horizon`` (`duffing_env.env_base.ExperimentEnv`).
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": _difference_track("env:DuffingEnv"),
     "duffing_env/Short-v0": _difference_track("tracks.limited_tracks:ShortEnv", horizon=48),
@@ -65,11 +65,11 @@ TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Short-v1": _continuous_track("ContinuousShortEnv", horizon=48),
     "duffing_env/Power-v1": _continuous_track("ContinuousPowerEnv", max_rms=0.0222),
     "duffing_env/Output-v1": _continuous_track("ContinuousOutputEnv", max_output=0.3),
-    # Diffusion 0.1 of q'', counted as what a sample of it does to q: 0.1 δ^1.5 / √3.
+    # Diffusion 0.1 of q'' as the standard deviation of its effect on q in a sample: 0.1 δ^1.5 / √3 [rad].
     "duffing_env/Pendulum-v0": _model_track(
         "pendulum", **_PENDULUM_OPTIONS, process_noise=6.454972e-4, max_output=6.283185307179586
     ),
-    # By Euler's rule, as published: what a sample does to the velocity in rad per sample, δ √(0.1² δ + 1e-8).
+    # By Euler's rule, as published: the effect of a sample on the velocity, δ √(0.1² δ + 1e-8) [rad per sample].
     "duffing_env/Pendulum-v1": _model_track(
         "pendulum_map", **_PENDULUM_OPTIONS, process_noise=1.1180452e-3, max_output=4.0
     ),
@@ -92,12 +92,12 @@ TRACKS: dict[str, dict[str, Any]] = {
 
 
 def register_tracks() -> None:
-    """Register every track with Gymnasium; what is registered already is left as it is."""
+    """Register every track with Gymnasium that is not registered yet."""
     from gymnasium.envs.registration import register, registry
 
     for track_id, spec in TRACKS.items():
         if track_id not in registry:
             register(track_id, **spec)
-            # To Gymnasium a higher version of a name is a newer one, and it calls the others out of date. Here v0 is
-            # the paper's equation and v1 the differential equation, so the version is a part of the name.
+            # Gymnasium calls all but the highest version of a name out of date. Here v0 is the paper's equation and v1
+            # the differential equation, so the version is part of the name.
             registry[track_id].name = track_id.removeprefix("duffing_env/")

@@ -93,7 +93,7 @@ def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
 
 def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
     told = {"system": "pendulum", "mean": PENDULA, "std": {"p1": 0.3, "p2": 0.1, "p3": 0.3}}
-    with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std says .* but is 0.1"):
+    with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std gives .* but is 0.1"):
         ModelEnv(**told, plant_spread=0.1)
     assert not ModelExperiment(**told, plant_spread=0.0).kernel_params.parameter_stds.any()
     assert ModelExperiment(**told).kernel_params.parameter_stds.tolist() == [0.3, 0.1, 0.3]

@@ -126,7 +126,7 @@ BAD = [
     ({"history": 0}, "history must be a whole number from 1"),
     (
         {"reward": gain, "terminal": True},
-        "terminal and terminated_return must be left out with a reward of one's own",
+        "terminal and terminated_return must be left out where reward is a function",
     ),
     ({"mean": {"k": 1.0}}, "mean must give some of the parameters ['m', 'c', 'a', 'b'], but is"),
     ({"mean": {"m": -1.0}}, "mean['m'] must be a number from"),
@@ -158,7 +158,9 @@ def test_an_observation_keeps_its_number_of_entries():
     env = DuffingEnv(observation=lambda beliefs: np.zeros((len(beliefs.mean), width)))
     env.reset(seed=0)
     width = 4
-    with pytest.raises(ValueError, match="observation must give as many entries every time, but gave 3 at first and 4"):
+    with pytest.raises(
+        ValueError, match="observation must always give the same number of entries, but gave 3 at first and 4"
+    ):
         env.step([0.5])
 
 

@@ -110,7 +110,7 @@ def test_errors_name_the_option():
         ({"rig": {**RIG.to_dict(), "delay": 1}}, "rig must have no delay for an environment, but has 1"),
         (
             {"rig": {**RIG.to_dict(), "output": far}},
-            "output.offset must be within half of the range, which the motion is guessed by, but is",
+            "output.offset must be within half of the range, by which the motion is guessed, but is",
         ),
         ({"rig": RIG, "max_input": 1.5}, "max_input must be at most 1, the rig's own limit, but is 1.5"),
         ({"rig": RIG, "spread": 0.2}, "spread must be left out for a rig"),

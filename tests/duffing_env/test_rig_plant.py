@@ -175,7 +175,7 @@ def test_policies_find_their_limits():
 
 def test_nobody_knows_the_truth():
     env = around(Difference())
-    with pytest.raises(AttributeError, match="nobody knows"):
+    with pytest.raises(AttributeError, match="true parameters of a real plant are unknown"):
         _ = env.truth
     assert not hasattr(env, "truth")
     for reward in set(REWARDS) - {"information_gain", "expected_free_energy", "free_energy"}:
