@@ -108,8 +108,13 @@ def _ours(size: int, name: str, track: str, **options: Any) -> list[Row]:
     rows = []
     for threads, title in ((1, "1 thread"), (2, "2 threads")):
         if threads == 1 or size > LANES:
-            told: Any = {"num_envs": size, "vectorization_mode": "vector_entry_point", "threads": threads, **options}
-            envs = gym.make_vec(track, **told)
+            keywords: Any = {
+                "num_envs": size,
+                "vectorization_mode": "vector_entry_point",
+                "threads": threads,
+                **options,
+            }
+            envs = gym.make_vec(track, **keywords)
             rows.append(Row(f"{size}: ours, {name}, {title}", UNIT, timed(vector_steps(envs, EPISODES[track]))))
     return rows
 

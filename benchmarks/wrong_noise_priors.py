@@ -83,12 +83,14 @@ def inputs_of(policy: str, track: str, systems: int, seed: int) -> FloatArray:
     return np.array(actions)
 
 
-def identified(track: str, center: tuple[float, float], actions: FloatArray, seed: int, told: dict[str, Any]) -> Cell:
+def identified(
+    track: str, center: tuple[float, float], actions: FloatArray, seed: int, weighing: dict[str, Any]
+) -> Cell:
     """Play the inputs again to an estimator whose priors are centred so."""
     systems = actions.shape[1]
     guesses = dict(zip(("process_noise_guess", "measurement_noise_guess"), np.multiply(center, NOISE), strict=True))
     options = {"process_noise": NOISE, "measurement_noise": NOISE, "noise_range": 1.0, "max_output": NO_LIMIT}
-    envs = make_track_batch(track, systems, {"horizon": SAMPLES, **options, **guesses, **told})
+    envs = make_track_batch(track, systems, {"horizon": SAMPLES, **options, **guesses, **weighing})
     envs.reset(seed=seed)
     for action in actions:
         envs.step(action)
@@ -141,15 +143,15 @@ def main(config: Config) -> None:
         for policy in PLAYED[track]:
             actions = inputs_of(policy, track, config.systems, config.seed)
             known = identified(track, (1.0, 1.0), actions, config.seed, KNOWN)
-            told = {"noise_hypotheses": hypotheses}
+            weighing = {"noise_hypotheses": hypotheses}
             cells = [
-                identified(track, center, actions, config.seed, told)
+                identified(track, center, actions, config.seed, weighing)
                 for center in shown(centers, description=f"{track} {policy}")
             ]
             names = list(make_track_batch(track, 1).experiment.model.coefficients)
             titles = ["prior of σ_w", "of σ_v", *names, "all", "lost, nats"]
             print_texts_and_tables(
-                f"\n{track}, {policy}, {told}", format_table(titles, rows(cells, known), markdown=True)
+                f"\n{track}, {policy}, {weighing}", format_table(titles, rows(cells, known), markdown=True)
             )
             results[f"{track} {policy}"] = {
                 "verdict": verdict(cells, known),

@@ -127,14 +127,12 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         self.metadata = {**type(self).metadata, "autoreset_mode": self._autoreset_mode}
         self.experiment: Experiment = make_experiment(self.single_env_class.experiment_class, options)
         self.single_observation_space = observation_space(self.experiment)
-        n_hypotheses, n_observed = (
-            len(self.experiment.kernel_params.hypothesis_priors),
-            int(np.prod(self.single_observation_space.shape)),
-        )
+        n_hypotheses = len(self.experiment.kernel_params.hypothesis_priors)
+        n_observed = int(np.prod(self.single_observation_space.shape))
         if num_envs * n_hypotheses > MAX_ENVS or num_envs * n_observed > _MAX_OBSERVED_NUMBERS:
             raise ValueError(
-                f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each of "
-                f"{num_envs} environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
+                f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each "
+                f"of {num_envs} environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
             )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

@@ -69,18 +69,21 @@ class Case:
         return KINDS[self.kind](np.random.default_rng([self.seed, *self.kind.encode()]), **self.numbers)
 
     def __str__(self) -> str:
-        numbers = ", ".join(_told(*one) for one in self.numbers.items())
+        numbers = ", ".join(_label(*one) for one in self.numbers.items())
         return self.kind.replace("_", " ") + (numbers and f": {numbers}")
 
     def check(self, folder: Path) -> None:
         """Assert that the answer is right; ``folder`` is for the files."""
-        told = list(islice(answered(self.make(), folder), 4 if self.then else 1))
-        for expected, (verdict, result) in ((self.answer, told[0]), *([(self.then, told[-1])] if self.then else [])):
+        answers = list(islice(answered(self.make(), folder), 4 if self.then else 1))
+        for expected, (verdict, result) in (
+            (self.answer, answers[0]),
+            *([(self.then, answers[-1])] if self.then else []),
+        ):
             names = [warning.name for warning in result.warnings]
             assert verdict == "right" and not names if expected == "right" else expected in names, (verdict, names)
 
 
-def _told(name: str, value: Any) -> str:
+def _label(name: str, value: Any) -> str:
     """An argument in a few words."""
     match name:
         case "names":

@@ -52,8 +52,8 @@ class Gymnasium:
     def infos(self):
         """The same keys at a reset and every step; belief and truth at the end."""
         env = gym.make(ID)
-        told = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
-        assert all(info.keys() == KEYS for info in told)
+        given = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
+        assert all(info.keys() == KEYS for info in given)
         assert env.unwrapped.belief.physical()[0].shape == (len(env.unwrapped.truth),)
         envs = made()
         envs.reset(seed=0)
@@ -161,7 +161,7 @@ class Tianshou:
         critic = ContinuousCritic(preprocess_net=Net(state_shape=space.shape, hidden_sizes=[16]))
         policy = ProbabilisticActorPolicy(
             actor=actor, action_space=actions,
-            dist_fn=lambda told: torch.distributions.Independent(torch.distributions.Normal(*told), 1),
+            dist_fn=lambda given: torch.distributions.Independent(torch.distributions.Normal(*given), 1),
         )  # fmt: skip
         return PPO(policy=policy, critic=critic, optim=AdamOptimizerFactory(lr=1e-3))
 
@@ -190,9 +190,9 @@ class Tianshou:
         """In its replay buffer."""
         collector, _, buffer = self._collector(ROWS, 400)
         collector.collect(n_episode=4)
-        told = buffer.sample(0)[0].info
-        assert set(told.keys()) >= KEYS
-        assert np.count_nonzero(told.information_gain)
+        given = buffer.sample(0)[0].info
+        assert set(given.keys()) >= KEYS
+        assert np.count_nonzero(given.information_gain)
 
 
 class StableBaselines3:
@@ -251,8 +251,8 @@ class RLlib:
         from ray.rllib.algorithms.ppo import PPOConfig
 
         ray.init(num_cpus=1, include_dashboard=False, object_store_memory=10**8, ignore_reinit_error=True)
-        told = {"num_envs_per_env_runner": ROWS, "gym_env_vectorize_mode": "vector_entry_point"} if many else {}
-        config = PPOConfig().environment(ID).env_runners(num_env_runners=0, **told)
+        given = {"num_envs_per_env_runner": ROWS, "gym_env_vectorize_mode": "vector_entry_point"} if many else {}
+        config = PPOConfig().environment(ID).env_runners(num_env_runners=0, **given)
         return config.training(train_batch_size=192, minibatch_size=96, num_epochs=1).build_algo()
 
     def single(self):
@@ -291,8 +291,8 @@ class Minari:
             while not done:
                 _, _, terminated, truncated, _ = collector.step(collector.action_space.sample())
                 done = terminated or truncated
-        told = {"algorithm_name": "random", "code_permalink": "none", "author": "none", "author_email": "none@none"}
-        return collector.create_dataset(dataset_id=f"duffing/short-{infos}/random-v0", **told)
+        given = {"algorithm_name": "random", "code_permalink": "none", "author": "none", "author_email": "none@none"}
+        return collector.create_dataset(dataset_id=f"duffing/short-{infos}/random-v0", **given)
 
     def single(self):
         """Episodes into a data set."""

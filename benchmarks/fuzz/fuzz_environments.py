@@ -33,12 +33,12 @@ def made(name: str) -> Any:
     return env
 
 
-def unsound(env: Any, told: Any) -> str:
+def unsound(env: Any, result: Any) -> str:
     """What is wrong with what `reset` or `step` gave, or nothing."""
-    observation = told[0]
+    observation = result[0]
     if not env.observation_space.contains(observation):
         return "observation out of bounds"
-    if len(told) == 5 and not np.isfinite(told[1]).all():
+    if len(result) == 5 and not np.isfinite(result[1]).all():
         return "reward is not finite"
     return ""
 
@@ -67,6 +67,6 @@ def calls() -> st.SearchStrategy[Call]:
             function = lambda: env.reset(seed=seed, options=options)  # noqa: E731
             names = ("seed", "Seed", "reset_mask", "options")
         what = f"{name}: {'step' if names[0] == 'action' else 'reset'}"
-        return Call(what, function, names, lambda: env, lambda told: unsound(env, told))
+        return Call(what, function, names, lambda: env, lambda result: unsound(env, result))
 
     return call()

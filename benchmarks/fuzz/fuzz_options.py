@@ -43,9 +43,9 @@ def calls() -> st.SearchStrategy[Call]:
             env: Any = made[track](**{**gym.spec(track).kwargs, **given, **asked})
             fault = unsound(env, env.reset(seed=1))
             for action in (1.0, -1.0, 0.0, 1.0, 1.0):
-                told = env.step([action])
-                fault = fault or unsound(env, told)
-                if told[2] or told[3]:
+                result = env.step([action])
+                fault = fault or unsound(env, result)
+                if result[2] or result[3]:
                     env.reset()
             return fault
 

@@ -34,46 +34,46 @@ def returns(reward, max_output, **options):
         reward=reward, max_output=max_output, **options,
     )  # fmt: skip
     envs.reset(seed=spawn_seeds(0, SYSTEMS) * count)
-    told = np.zeros(count * SYSTEMS)
-    ended, running = told > 0, told == 0
+    returned = np.zeros(count * SYSTEMS)
+    ended, running = returned > 0, returned == 0
     for t in range(SAMPLES):
         states = envs.unwrapped.records[-2 * SYSTEMS : -SYSTEMS]
         push = np.where(states[:, 0] < states[:, 1], -1.0, 1.0)
         actions = np.concatenate([np.repeat(inputs[:, t], SYSTEMS), push, np.zeros(SYSTEMS)])
         _, rewards, terminated, truncated, _ = envs.step(actions[:, None].astype(np.float32))
-        told[running] += rewards[running]
+        returned[running] += rewards[running]
         ended |= running & terminated
         running &= ~(terminated | truncated)
-    return told.reshape(count, SYSTEMS), ended.reshape(count, SYSTEMS)
+    return returned.reshape(count, SYSTEMS), ended.reshape(count, SYSTEMS)
 
 
 @pytest.mark.parametrize("reward", LEARNABLE)
 def test_a_blow_up_returns_less_than_no_input_where_that_is_asked_for(reward):
     for limit in LIMITS:
-        told, ended = returns(reward, limit, terminated_return=WORTH)
+        returned, ended = returns(reward, limit, terminated_return=WORTH)
         assert ended.sum() >= SYSTEMS
         assert ended[-2].all()
         assert not ended[-1].any()
-        worse = told < told[-1]
+        worse = returned < returned[-1]
         assert worse[ended].all(), limit
-        np.testing.assert_allclose(told[ended], WORTH, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(returned[ended], WORTH, rtol=0, atol=1e-9)
 
 
 def test_it_does_so_where_the_reward_is_paid_at_the_end():
-    told, ended = returns("information_gain", RAISED, terminated_return=WORTH, terminal=True)
+    returned, ended = returns("information_gain", RAISED, terminated_return=WORTH, terminal=True)
     assert ended[-2].all()
-    np.testing.assert_array_equal(told[ended], WORTH)
+    np.testing.assert_array_equal(returned[ended], WORTH)
 
 
 def test_what_was_gained_before_the_end_is_kept_otherwise():
     # The figures of `duffing_env.rewards.reward_registry`.
-    told, ended = returns("information_gain", STANDARD)
+    returned, ended = returns("information_gain", STANDARD)
     assert ended[-2].all()
-    assert told[-2].mean() == pytest.approx(15.2, abs=0.05)
-    assert told[-1].mean() == pytest.approx(2.4, abs=0.05)
-    told, ended = returns("information_gain", RAISED)
+    assert returned[-2].mean() == pytest.approx(15.2, abs=0.05)
+    assert returned[-1].mean() == pytest.approx(2.4, abs=0.05)
+    returned, ended = returns("information_gain", RAISED)
     assert ended[-2].all()
-    assert told[-2].mean() == pytest.approx(23.5, abs=0.05)
+    assert returned[-2].mean() == pytest.approx(23.5, abs=0.05)
 
 
 @pytest.mark.parametrize("reward", LEARNABLE)

@@ -56,13 +56,13 @@ def test_a_promise_is_for_the_sample_and_not_for_what_drift_forgets():
 
 
 def test_promises_are_kept_on_average_by_calibrated_beliefs():
-    promised, gained = (np.nansum(told, axis=0) for told in sums())
+    promised, gained = (np.nansum(column, axis=0) for column in sums())
     assert promised.mean() == pytest.approx(17.79, abs=0.01)  # the figures of `duffing_env.rewards.reward_registry`
     assert abs((promised - gained).mean()) < 0.05
 
 
 @pytest.mark.slow  # as `twin.PAIRS` tells
 def test_promises_are_not_kept_by_a_mean_field():
-    promised, gained = (np.nansum(told, axis=0) for told in sums(factorisation="mean_field"))
+    promised, gained = (np.nansum(column, axis=0) for column in sums(factorisation="mean_field"))
     assert promised.mean() == pytest.approx(10.9, abs=0.05)
     assert gained.mean() == pytest.approx(16.5, abs=0.05)

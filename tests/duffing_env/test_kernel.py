@@ -106,8 +106,8 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
     # θ₁ = 1 + m / (m + c h) - a η cancels; the others are products. None takes more than eight operations on a side.
     sizes = np.abs(expected)
     sizes[0] = 1 - expected[2] + drawn[2] * expected[3]
-    told = np.stack([batch.row_values(f"TRUE_{name}") for name in COEFFICIENTS])
-    assert (np.abs(told - expected) <= 16 * U64 * sizes).all()
+    stored = np.stack([batch.row_values(f"TRUE_{name}") for name in COEFFICIENTS])
+    assert (np.abs(stored - expected) <= 16 * U64 * sizes).all()
 
 
 def test_prior_has_the_moments_of_the_oscillators():

@@ -44,9 +44,9 @@ def test_packages_of_ours_are_ours(site, monkeypatch):
 def test_a_package_that_is_written_over_is_told(site, monkeypatch, text):
     write_over(site, "agents", text)
     monkeypatch.setattr(sys, "path", [str(site)])
-    told = overwrite_message("agents", site)
-    assert f"{site / 'agents'} is no longer duffing-env's" in told
-    assert "pip install --force-reinstall --no-deps duffing-env" in told
+    message = overwrite_message("agents", site)
+    assert f"{site / 'agents'} is no longer duffing-env's" in message
+    assert "pip install --force-reinstall --no-deps duffing-env" in message
 
 
 def test_agents_of_another_distribution_are_a_warning(site):

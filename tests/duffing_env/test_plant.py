@@ -87,5 +87,5 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
 @pytest.mark.parametrize(("deviation", "off_record"), [(0.0, 0.0), (2e-8, 0.0), (-2e-8, 0.0), (1e-7, 1.0), (-0.1, 1.0)])
 def test_a_record_answers_the_recorded_input_only(deviation, off_record):
     # A float32 action in [-1, 1] is within 3e-8 of the number that it stands for; here it is scaled by 0.15.
-    told = replay_sample(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
-    assert told == (0.1, -0.3, off_record)
+    answer = replay_sample(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
+    assert answer == (0.1, -0.3, off_record)

@@ -228,9 +228,9 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
 
 @pytest.mark.parametrize("reward", WORKED)
 def test_work_that_is_not_finite_ends_the_episode(reward):
-    for told in (np.nan, np.inf, -np.inf):
+    for paid in (np.nan, np.inf, -np.inf):
         lanes = Lanes(reward=reward)
-        lanes["WORK"][3] = told
+        lanes["WORK"][3] = paid
         lanes.settle()
         assert np.flatnonzero(lanes["DIVERGED"]).tolist() == [3]
         np.testing.assert_array_equal(lanes["REWARD"], 0.0)
@@ -249,17 +249,17 @@ def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
 
 def three_steps(**options):
     """Rewards (3, LANES) of steps that are worth 1, 2 and 3, less a cost of ½; lane 1 is terminated by the last."""
-    lanes, told = Lanes(reward="fisher"), []
+    lanes, paid = Lanes(reward="fisher"), []
     lanes["ELAPSED"][:] = HORIZON - 3
     lanes["INPUT"][:] = 0.1
     for worth in (1.0, 2.0, 3.0):
         lanes["WORK"][:] = worth
         lanes["Y_y"][1] = 0.7 if worth == 3.0 else 0.0
         lanes.settle(input_cost=50.0, **options)
-        told.append(lanes["REWARD"].copy())
+        paid.append(lanes["REWARD"].copy())
     assert lanes["TERMINATED"][:3].tolist() == [0, 1, 0]
     assert lanes["TRUNCATED"][:3].tolist() == [1, 0, 1]
-    return np.array(told)
+    return np.array(paid)
 
 
 def test_a_terminal_reward_is_the_sum_at_the_end():
@@ -272,10 +272,10 @@ def test_a_terminal_reward_is_the_sum_at_the_end():
 @pytest.mark.parametrize("terminal", [False, True])
 def test_an_episode_that_is_terminated_returns_what_was_said(terminal):
     for worth in (-10.0, 0.0, 2.5):
-        kept, told = three_steps(terminal=terminal), three_steps(terminal=terminal, terminated_return=worth)
-        np.testing.assert_allclose(told.sum(axis=0)[1], worth, rtol=0, atol=1e-14)
-        told[2, 1] = kept[2, 1]
-        np.testing.assert_array_equal(told, kept)  # and nothing else is touched
+        kept, paid = three_steps(terminal=terminal), three_steps(terminal=terminal, terminated_return=worth)
+        np.testing.assert_allclose(paid.sum(axis=0)[1], worth, rtol=0, atol=1e-14)
+        paid[2, 1] = kept[2, 1]
+        np.testing.assert_array_equal(paid, kept)  # and nothing else is touched
 
 
 def test_an_episode_that_diverges_returns_what_was_said():

@@ -44,12 +44,12 @@ def test_it_falls_with_what_is_learned_and_sums_to_at_most_one():
         "duffing_env/Amplitude-v0", num_envs=64, vectorization_mode="vector_entry_point", reward="simulation_error"
     )
     envs.reset(seed=0)
-    rng, told, running = np.random.default_rng(0), [], np.ones(64, dtype=bool)
+    rng, rewards_paid, running = np.random.default_rng(0), [], np.ones(64, dtype=bool)
     for _ in range(256):
         _, rewards, terminated, truncated, _ = envs.step(rng.uniform(-1, 1, (64, 1)).astype(np.float32))
-        told.append(np.where(running, rewards, 0.0))
+        rewards_paid.append(np.where(running, rewards, 0.0))
         running &= ~(terminated | truncated)
-    sums = np.cumsum(told, axis=0)
+    sums = np.cumsum(rewards_paid, axis=0)
     assert np.abs(sums).max() <= 1
     assert (np.diff(sums[[0, 15, 63, 255]].mean(axis=1)) > 0).all()
     errors = envs._batch.row_values("MISFIT")

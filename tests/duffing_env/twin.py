@@ -254,11 +254,11 @@ class TwinEnv:
         """x (64,) of the model alone, from rest under the test input."""
         t1, t2, t3, e = (float(c) for c in coefficients)
         x = last_x = 0.0
-        told = []
+        values = []
         for u in (self.max_input * multisine()).tolist():
             x, last_x = t1 * x + t2 * x * x * x + t3 * last_x + e * u, x
-            told.append(x)
-        return np.array(told)
+            values.append(x)
+        return np.array(values)
 
     def _appraise(self):
         """What the belief is worth by each reward that is a difference: a step's reward is its increase."""
@@ -317,12 +317,12 @@ class TwinContinuousEnv(TwinEnv):
         """x (64,) of the model alone, from rest under the test input."""
         if self.estimator != "ode":
             return super().free_run(coefficients)
-        state, told = np.zeros(2), []
+        state, values = np.zeros(2), []
         with np.errstate(all="ignore"):
             for u in self.max_input * multisine():
                 state = moved(oscillator(), state, coefficients, (u,))
-                told.append(state[0])
-        return np.array(told)
+                values.append(state[0])
+        return np.array(values)
 
     def _move(self):
         # A pair of numbers for each of eight sub-steps, and one for the sensor.
@@ -359,8 +359,8 @@ def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
         for name in PARAMETERS:
             np.testing.assert_allclose(getattr(env.truth, name), getattr(twin.truth, name), rtol=1e-14)
         if twin.noise_range > 1:
-            told = env.truth.process_noise, env.truth.measurement_noise
-            np.testing.assert_allclose(told, (twin.process_noise, twin.measurement_noise), rtol=1e-14)
+            values = env.truth.process_noise, env.truth.measurement_noise
+            np.testing.assert_allclose(values, (twin.process_noise, twin.measurement_noise), rtol=1e-14)
         terminated = truncated = False
         while not (terminated or truncated):
             action = rng.uniform(-1.2, 1.2, 1).astype(np.float32)
@@ -369,8 +369,8 @@ def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
             np.testing.assert_allclose(observation, expected, **ROUNDED)
             np.testing.assert_allclose(received, rewards[reward], rtol=1e-9, atol=1e-9)
             gains = (twin.reported["information_gain"], twin.reported["log_posterior"])
-            told = (info["information_gain"], info["log_posterior_gain"])
-            np.testing.assert_allclose(told, gains, rtol=1e-9, atol=1e-9)
+            values = (info["information_gain"], info["log_posterior_gain"])
+            np.testing.assert_allclose(values, gains, rtol=1e-9, atol=1e-9)
             assert [terminated, truncated] == flags
             assert not info["diverged"]
         assert_beliefs_agree(env.belief, twin.belief)

@@ -106,8 +106,8 @@ def test_with_noises_that_are_known_theirs_is_our_filter(
     name: str, process_noise: float, tolerance: float, sections: Sections, given: dict
 ) -> None:
     u, y = sections.training.u[:300], sections.training.y[:300]
-    told = {**given, f"{name}_process_variance": process_noise**2}
-    theirs = extended_kalman_filter(silverbox_peer_filters.model(told, name), u, y)
+    with_noise = {**given, f"{name}_process_variance": process_noise**2}
+    theirs = extended_kalman_filter(silverbox_peer_filters.model(with_noise, name), u, y)
     prior = silverbox_comparison.prior_of(name)
     certain = 1e15
     noises = (certain, certain * max(process_noise, 1e-15) ** 2), (certain, certain * 3e-4**2)
