@@ -25,7 +25,6 @@ from duffing_env.kernel import RESET_MANUALLY
 from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
 from estimator.models.named_parameters import Parameters
-from estimator.support.argument_checks import check_choice, short_repr, to_float_array
 from estimator.support.argument_checks import check_choice
 
 if TYPE_CHECKING:

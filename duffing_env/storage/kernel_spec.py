@@ -44,7 +44,7 @@ class KernelSpec(NamedTuple):
             whose weights are in `KernelParams`.
         has_noise_hypotheses: whether an environment weighs several beliefs
             (`duffing_env.kernel_stages.noise_filter_bank`); their number is in `KernelParams`.
-        uses_cubature: whether sigma points propagate these beliefs (`estimator.engine`).
+        uses_cubature: whether sigma points propagate these beliefs (`estimator.engine.cubature`).
     """
 
     belief_model: Model

@@ -124,7 +124,7 @@ class ContinuousEnv(DuffingEnv):
 
     ## Version history
 
-    * v1: Eq. (1) in place of Eq. (2), and noises that nobody knows
+    * v1: Eq. (1) in place of Eq. (2), and unknown noises
     """
 
     experiment_class: ClassVar[type[Experiment]] = ContinuousExperiment
@@ -140,7 +140,7 @@ class ContinuousShortEnv(ContinuousEnv):
 
     ## Version history
 
-    * v1: Eq. (1) in place of Eq. (2), and noises that nobody knows
+    * v1: Eq. (1) in place of Eq. (2), and unknown noises
     """
 
 
@@ -154,7 +154,7 @@ class ContinuousPowerEnv(ContinuousEnv):
 
     ## Version history
 
-    * v1: Eq. (1) in place of Eq. (2), and noises that nobody knows
+    * v1: Eq. (1) in place of Eq. (2), and unknown noises
     """
 
 
@@ -168,7 +168,7 @@ class ContinuousOutputEnv(ContinuousEnv):
 
     ## Version history
 
-    * v1: Eq. (1) in place of Eq. (2), and noises that nobody knows
+    * v1: Eq. (1) in place of Eq. (2), and unknown noises
     """
 
 

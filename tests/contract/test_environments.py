@@ -1,4 +1,4 @@
-"""What every environment promises: Gymnasium's contract, seeds, copies, held actions, and numbers that are finite."""
+"""The contract of every environment: Gymnasium's rules, seeds, copies, held actions, and finite numbers."""
 
 import copy
 

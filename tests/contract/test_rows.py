@@ -1,4 +1,4 @@
-"""Many environments at once are single ones, to the bit, however many there are and whoever steps them."""
+"""Rows of a vector environment equal single environments, to the bit, for any number of rows and threads."""
 
 import gymnasium as gym
 import numba

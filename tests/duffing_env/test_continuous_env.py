@@ -1,4 +1,4 @@
-"""The tracks on Eq. (1): against their twin, and what its docstring promises."""
+"""The tracks on Eq. (1): against their twin, and the statements of the docstring."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,4 +1,4 @@
-"""Whether an environment's 90 % intervals hold the truth with unknown noises; docs/evidence/coverage.md has figures.
+"""Coverage of an environment's 90 % intervals with unknown noises; docs/evidence/coverage.md has the figures.
 
 ``pytest -m slow -s tests/duffing_env/test_coverage_of_hypotheses.py`` prints them.
 """

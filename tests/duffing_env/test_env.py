@@ -1,4 +1,4 @@
-"""The single environment: Gymnasium's contract, and what the class docstring promises."""
+"""The single environment: Gymnasium's contract, and the statements of the class docstring."""
 
 import copy
 import dataclasses

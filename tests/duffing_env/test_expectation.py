@@ -61,7 +61,7 @@ def test_promises_are_kept_on_average_by_calibrated_beliefs():
     assert abs((promised - gained).mean()) < 0.05
 
 
-@pytest.mark.slow  # as `twin.PAIRS` tells
+@pytest.mark.slow  # slow for the reason at `test_kernel.PAIRS`
 def test_promises_are_not_kept_by_a_mean_field():
     promised, gained = (np.nansum(column, axis=0) for column in sums(factorisation="mean_field"))
     assert promised.mean() == pytest.approx(10.9, abs=0.05)

@@ -1,4 +1,4 @@
-"""What an experiment may be, and what the kernel is told of it."""
+"""The options of an experiment, and the kernel's parameters from them."""
 
 import dataclasses
 import json

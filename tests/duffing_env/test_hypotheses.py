@@ -20,8 +20,8 @@ from duffing_env.vector_env import DuffingVectorEnv
 from estimator import OnlineEstimator, Rig
 from estimator.compilation.simd import LANES
 
-#: Nine members each: of four environments they share a block with others'. The reward's kernel tells the mixture's own
-#: free energy, and what a step tells of the information and the posterior are rewards, too.
+#: Nine members each, so that four environments' members share blocks. The kernel of this reward gives the mixture's
+#: free energy; the infos of a step give the information gain and the log posterior gain, which are rewards as well.
 OPTIONS = {**GUESSED, "reward": "free_energy", "horizon": 256, "max_output": 0.6}
 
 
@@ -106,7 +106,7 @@ def test_the_belief_is_that_of_the_online_estimator(case):
 
 
 def test_blocks_that_more_members_share_with_their_neighbours():
-    # Fifteen members each, of 70 environments: what is told of one does not depend on those beside it.
+    # Fifteen members each, of 70 environments: no environment's numbers depend on its neighbours.
     options = OPTIONS | {"noise_hypotheses": 5, "horizon": 25, "max_output": 0.2}
     actions = random_actions(30, 70)
     envs = DuffingVectorEnv(70, **options)

@@ -1,4 +1,4 @@
-"""A package of ours that another distribution has written over is told, with what to do."""
+"""The message about a package of ours that another distribution has overwritten."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Arrays that are given out again are those that nobody holds."""
+"""The pool reuses only arrays without another reference."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""Rendering: what a frame shows, that it needs no display, and what it costs."""
+"""Rendering: the contents of a frame, its cost, and that it needs no display."""
 
 import copy
 import os

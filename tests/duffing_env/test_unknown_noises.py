@@ -1,4 +1,4 @@
-"""Noises that nobody knows: drawn for every episode, guessed wrong."""
+"""Unknown noises: drawn for every episode, and wrong guesses of them."""
 
 import numpy as np
 import pytest

@@ -131,7 +131,7 @@ def test_a_peer_that_answers_our_means_gets_our_errors(
     monkeypatch.setattr("research.studies.silverbox_protocol.TRAINING_LENGTHS", lengths)
     monkeypatch.setattr("research.studies.silverbox_protocol.TRAINING_SAMPLES", 3000)
     monkeypatch.setattr("research.studies.silverbox_protocol.N_TIMINGS", 1)
-    monkeypatch.setattr(silverbox_comparison, "LENGTHS", lengths)
+    monkeypatch.setattr(silverbox_comparison, "TRAINING_LENGTHS", lengths)
     monkeypatch.setattr(silverbox_comparison, "TRAINING_SAMPLES", 3000)
     outcome = evaluate(SETTINGS[ours], sections)
     means = []
