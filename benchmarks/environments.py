@@ -18,7 +18,7 @@ from benchmarks.peer_process import Peers
 from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import Row, later, measure, timed
 from estimator.compilation.simd import LANES
-from estimator.inference import DEFAULT_ITERATIONS
+from estimator.support.update_options import DEFAULT_ITERATIONS
 
 TRACK, CONTINUOUS = "duffing_env/Amplitude-v0", "duffing_env/Amplitude-v1"
 UNIT = "env-steps/s"

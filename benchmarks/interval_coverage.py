@@ -18,8 +18,8 @@ from benchmarks.random_systems import SPREAD, draw, make_model, make_prior, make
 from duffing_env.tracks.continuous_tracks import ContinuousVectorEnv
 from estimator import OnlineEstimator, coefficients_of, duffing
 from estimator.belief import Belief
-from estimator.inference import EXPECTATIONS
 from estimator.support.array_types import FloatArray
+from estimator.support.update_options import EXPECTATIONS
 
 #: Probability of the intervals.
 LEVEL = 0.90

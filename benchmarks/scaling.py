@@ -11,7 +11,7 @@ from agents.evaluation.figures import new_figure, save_png
 from benchmarks.environments import TRACK, vector_steps
 from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import CORES, Result, Row, later, measure, timed
-from estimator.inference import DEFAULT_ITERATIONS
+from estimator.support.update_options import DEFAULT_ITERATIONS
 
 UNIT = "ns/env-step"
 SIZE = 1024

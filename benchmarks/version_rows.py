@@ -51,7 +51,11 @@ def update_of(equation: str) -> tuple[Any, list[int], int, int]:
     continuous = equation == "Eq. (1)"
     if HAS_ENGINE:
         from estimator import difference, duffing
-        from estimator.engine.kernels import compile_belief_update
+
+        try:
+            from estimator.engine.kernels import compile_belief_update
+        except ImportError:  # the names of an older version
+            from estimator.engine.tasks import structured as compile_belief_update
 
         task = compile_belief_update(duffing() if continuous else difference(), int(continuous))
         inputs = [task.layout[name] for name in ("U_0", "U_1")[: 1 + continuous]]

@@ -17,7 +17,6 @@ from duffing_env.rewards.reward_registry import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
 from estimator.belief import Belief
-from estimator.inference import DEFAULT_ITERATIONS, MAX_ITERATIONS
 from estimator.inference.noise_grid import NoiseGridSize, initial_weights, member_priors, mixture_record
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
@@ -35,6 +34,8 @@ from estimator.support.argument_checks import (
     short_repr,
 )
 from estimator.support.array_types import FloatArray
+from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
+from estimator.support.update_options import DEFAULT_ITERATIONS, MAX_ITERATIONS
 
 #: Largest number of noise ratios, or of values of each noise: more are not worth their time.
 MAX_HYPOTHESES = 99

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.storage_layout import belief_rows
-from estimator.inference import DEFAULT_ITERATIONS
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.units import MAGNITUDE_BOUNDS, VOLT_SCALES, Scales
 from estimator.support.argument_checks import check_choice, check_number, short_repr, to_float_array
 from estimator.support.array_types import FloatArray
+from estimator.support.update_options import DEFAULT_ITERATIONS
 
 
 @cache

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
-from estimator.inference import DEFAULT_ITERATIONS
 from estimator.inference.filter import Filter
 from estimator.inference.noise_grid import NoiseGridSize, NoiseRatio
 from estimator.models.difference_equation import difference
@@ -22,6 +21,8 @@ from estimator.settings import EstimatorSettings, checked_settings
 from estimator.support.argument_checks import to_finite_series, to_scalar
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import show_progress
+from estimator.support.progress import show_progress as shown
+from estimator.support.update_options import DEFAULT_ITERATIONS
 
 _SAMPLES_BETWEEN_REPORTS = 5_000
 

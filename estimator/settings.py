@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from estimator.inference import DEFAULT_ITERATIONS, EXPECTATIONS, MAX_ITERATIONS
 from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_bool, check_choice, check_integer, check_number
+from estimator.support.update_options import DEFAULT_ITERATIONS, EXPECTATIONS, MAX_ITERATIONS
 
 #: More ratios of the noises than data could tell apart; and of two numbers, more values of each than there are noises.
 _MAX_HYPOTHESES, _MAX_VALUES_PER_NOISE = 1000, 99

@@ -20,8 +20,8 @@ from duffing_env.storage.kernel_spec import (
 )
 from estimator.compilation.scalar_jit import scalar_jit
 from estimator.compilation.simd import LANES, source_digest, source_folders
-from estimator.engine import source_cache as stored
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import belief_rows
 from estimator.models.model import Model
 
@@ -41,7 +41,7 @@ def generated_functions(spec: KernelSpec) -> Any:
     """The compiled functions of a kind of experiment, as attributes by the names in `_environment_source`."""
     digests = (spec.belief_model.digest, spec.plant_model and spec.plant_model.digest)
     key = source_digest(source_folders(__file__)) + repr((spec[2:], digests))
-    return stored.load_generated(
+    return load_generated(
         spec.belief_model.name, "environment", key, lambda: _environment_source(spec), _COMPILED_NAMES
     )
 

@@ -11,8 +11,8 @@ from functools import cache
 from itertools import combinations_with_replacement
 from typing import Any
 
-from estimator.engine import source_cache as stored
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, likelihood_rows
 from estimator.models.model import Model
 
@@ -48,7 +48,7 @@ def compile_adjoint(model: Model, degree: int = 0) -> Any:
     if degree not in (0, 1):
         raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
     key = repr((model.digest, degree))
-    return stored.load_generated(model.name, "gradient", key, lambda: _source(model, degree), RUNTIME_FUNCTIONS)
+    return load_generated(model.name, "gradient", key, lambda: _source(model, degree), RUNTIME_FUNCTIONS)
 
 
 def _source(model: Model, degree: int) -> str:

@@ -12,9 +12,9 @@ from functools import cache
 from typing import Any
 
 from estimator.compilation.simd import LANES
-from estimator.engine import source_cache as stored
 from estimator.engine.adjoint import with_reverse
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, linearised_filter_layout
 from estimator.models.model import Model
 
@@ -45,9 +45,7 @@ def compile_lane_adjoint(model: Model, degree: int = 0) -> LaneAdjoint:
     """The paths of a model, along the response without noise; ``degree`` as in `estimator.engine.adjoint.compile_adjoint`."""
     place = linearised_filter_layout(model, degree, follows_outputs=False)
     key = repr((model.digest, degree))
-    code = stored.load_generated(
-        model.name, "gradient-lanes", key, lambda: _source(model, degree, place), RUNTIME_FUNCTIONS
-    )
+    code = load_generated(model.name, "gradient-lanes", key, lambda: _source(model, degree, place), RUNTIME_FUNCTIONS)
     return LaneAdjoint(code.forward, code.backward, place, code.n_tape)
 
 
@@ -85,21 +83,21 @@ def _sample_source(n_filter_state: int, n_integrated: int, first_integrated: int
         f"n_tape = {n_filter_state + (steps + 1) * n_integrated if n_integrated else n_filter_state}\n"
         "@jit\ndef keep(W, first, tape, t, place, count):\n"
         "    for i in range(count):\n        tape[t, place + i] = W[first + i]\n"
-        "@jit\ndef lay(W, first, tape, t, place, count):\n"
+        "@jit\ndef restore(W, first, tape, t, place, count):\n"
         "    for i in range(count):\n        W[first + i] = tape[t, place + i]\n"
     )
     if not n_integrated:
         return source + (
             f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    finish(W)\n"
-            f"@jit\ndef backward(W, A, tape, t):\n    lay(W, 0, tape, t, 0, {n_filter_state})\n    finish_back(W, A)\n"
+            f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n_filter_state})\n    finish_back(W, A)\n"
         )
     return source + (
         f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    begin(W)\n"
         f"    for s in range({steps}):\n        keep(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
         f"        move(W, s / {steps})\n"
         f"    keep(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish(W)\n"
-        f"@jit\ndef backward(W, A, tape, t):\n    lay(W, 0, tape, t, 0, {n_filter_state})\n"
-        f"    lay(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish_back(W, A)\n"
-        f"    for s in range({steps - 1}, -1, -1):\n        lay(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
+        f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n_filter_state})\n"
+        f"    restore(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish_back(W, A)\n"
+        f"    for s in range({steps - 1}, -1, -1):\n        restore(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
         f"        move_back(W, A, s / {steps})\n    begin_back(W, A)\n"
     )

@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import Any
 
 from estimator.compilation.simd import LANES, number_rows
-from estimator.engine import source_cache as stored
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import upper_triangle_names
 from estimator.models.model import Model
 
@@ -73,7 +73,7 @@ def compile_expected_update(model: Model, degree: int = 0, lag: int = 0) -> Expe
         *state_rows, *trajectory_rows, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR", "CELL"
     )
     key = repr((model.digest, degree, lag))
-    code = stored.load_generated(
+    code = load_generated(
         model.name, "imagination", key, lambda: _source(model, degree, lag, inputs, layout), RUNTIME_FUNCTIONS
     )
     return ExpectedUpdate(code.advance, code.final_information, layout, len(state_rows))

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from estimator.compilation.simd import jit_closure
+from estimator.models.interpolation import CAUSAL_INTERPOLATION_DEGREES
 from estimator.models.model import Model
-from estimator.rigs.rig import INTERPOLATION_DEGREES
 from estimator.support.argument_checks import check_choice
-
-#: Ways of the input between two samples that depend on these alone, and the degree of the polynomial of each.
-_CAUSAL_DEGREES = {name: degree for name, degree in INTERPOLATION_DEGREES.items() if degree < 2}
 
 
 def input_degree(model: Model, interpolation: str) -> int:
@@ -20,13 +17,13 @@ def input_degree(model: Model, interpolation: str) -> int:
     Raises:
         ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
     """
-    check_choice("interpolation", interpolation, _CAUSAL_DEGREES)
+    check_choice("interpolation", interpolation, CAUSAL_INTERPOLATION_DEGREES)
     if not model.is_continuous and interpolation != "zero_order":
         raise ValueError(
             f"interpolation must be 'zero_order' for the difference equation {model.name!r}, whose inputs are samples, "
             f"but is {interpolation!r}"
         )
-    return _CAUSAL_DEGREES[interpolation]
+    return CAUSAL_INTERPOLATION_DEGREES[interpolation]
 
 
 def n_older_inputs(model: Model, degree: int) -> int:

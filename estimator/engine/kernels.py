@@ -16,7 +16,7 @@ import numpy as np
 from estimator.compilation import elementary_functions
 from estimator.compilation.scalar_jit import scalar_jit
 from estimator.compilation.simd import LANES, number_rows
-from estimator.engine import source_cache as stored
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import (
     cubature_order,
     cubature_rows,
@@ -25,9 +25,9 @@ from estimator.engine.storage_layout import (
     trace_rows,
     update_layout,
 )
-from estimator.inference import EXPECTATIONS, MAX_ITERATIONS
 from estimator.models.model import GENERATED_FUNCTIONS, Model
 from estimator.support.argument_checks import check_choice, check_integer
+from estimator.support.update_options import EXPECTATIONS, MAX_ITERATIONS
 
 
 @scalar_jit
@@ -132,12 +132,12 @@ def _compile_belief_update(
     key = repr(
         (model.digest, degree, iterations, lanes, sorted(layout.items()), keep_trace, may_be_missing, expectations)
     )
-    code = stored.load_generated(model.name, "update", key, make, RUNTIME_FUNCTIONS)
-    return BeliefUpdate(code.update, layout, code.spread if uses_cubature else None)
+    code = load_generated(model.name, "update", key, make, RUNTIME_FUNCTIONS)
+    return BeliefUpdate(code.update, layout, code.cubature_columns if uses_cubature else None)
 
 
 def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes: int) -> str:
-    """Source of ``spread(W)``, and of ``update(W)`` that takes all points through the sample."""
+    """Source of ``cubature_columns(W)``, and of ``update(W)`` that takes all points through the sample."""
     from estimator.engine import cubature, printer_numba, symbolic, variational_rk4
 
     names = cubature_order(model)
@@ -150,33 +150,40 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
         return printer_numba.print_lane_loop(name, lines, results, point_layout, lanes, uniform, doc)
 
     source = loop(
-        "spread", *cubature.cubature_columns(model), (), "Columns of the covariance's factor, and their weights."
+        "cubature_columns",
+        *cubature.cubature_columns(model),
+        (),
+        "Columns of the covariance's factor, and their weights.",
     )
     if not model.is_continuous:
         sample = cubature.propagate_point_difference(model)
-        source += loop("carry", *sample, ("C", "SIGN", "P"), "One point over the sample.")
-        return source + _loop_over_points(model, "", "        carry(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
+        source += loop("propagate_point", *sample, ("C", "SIGN", "P"), "One point over the sample.")
+        return source + _loop_over_points(model, "", "        propagate_point(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
     noise = [name for name in integrator_rows(model) if name[0] != "S"]
     start = {
         i: printer_numba.print_expression(value) for i, value in symbolic.integrator_start(model).items() if i in noise
     }
     source += loop("begin", [], start, (), "The mean, and its process noise.")
     step = variational_rk4.variational_rk4_step(model, degree)
-    source += loop("drift", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise.")
-    source += loop("place", *cubature.place_point(model), ("C", "SIGN"), "A point at the start of the sample.")
+    source += loop(
+        "step_mean_and_noise", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise."
+    )
+    source += loop("place_point", *cubature.place_point(model), ("C", "SIGN"), "A point at the start of the sample.")
     step, moved = cubature.propagate_point(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
     source += loop("move", step, moved, ("T",), "One Runge-Kutta step of a point.")
-    source += loop("keep", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
+    source += loop("keep_image", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
     n = model.substeps
-    noise_loop = f"    begin(W)\n    for s in range({n}):\n        drift(W, s / {n})\n"
-    body = "        place(W, P // 2, 1.0 - 2.0 * (P % 2))\n"
-    body += f"        for s in range({n}):\n            move(W, s / {n})\n        keep(W, P)\n"
+    noise_loop = f"    begin(W)\n    for s in range({n}):\n        step_mean_and_noise(W, s / {n})\n"
+    body = "        place_point(W, P // 2, 1.0 - 2.0 * (P % 2))\n"
+    body += f"        for s in range({n}):\n            move(W, s / {n})\n        keep_image(W, P)\n"
     return source + _loop_over_points(model, noise_loop, body)
 
 
 def _loop_over_points(model: Model, before: str, body: str) -> str:
     """Source of ``update(W)`` over all sigma points."""
-    head = f"@scalar_jit\ndef update(W):\n    spread(W)\n{before}    for P in range({2 * len(model.dynamic_names)}):\n"
+    head = (
+        f"@scalar_jit\ndef update(W):\n    cubature_columns(W)\n{before}    for P in range({2 * len(model.dynamic_names)}):\n"
+    )
     return head + body + "    finish(W)\n"
 
 
@@ -224,6 +231,4 @@ def compile_linearised_filter(
         return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
 
     key = repr((model.digest, degree, follows_outputs, lanes, variable_step))
-    return LinearisedFilter(
-        stored.load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes
-    )
+    return LinearisedFilter(load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes)

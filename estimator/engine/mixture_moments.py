@@ -16,7 +16,7 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 from estimator.compilation.simd import LANES
-from estimator.engine import source_cache as stored
+from estimator.engine.source_cache import load_generated
 
 #: Noises of a belief: of the process and of a sensor.
 N_NOISES = 2
@@ -38,7 +38,7 @@ def compile_mixture_moments(n_quantities: int) -> Any:
         - ``spreads(B, at, S, s, X, n)``: adds s (P + (x - X)(x - X)ᵀ) and, in the rows of the rates, s v;
         - ``tails(B, at, S, s, X, n)``: adds the relative variances of the noises in the rows of the shapes.
     """
-    return stored.load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
+    return load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
 
 
 def _source(n_quantities: int) -> str:

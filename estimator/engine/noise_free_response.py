@@ -19,9 +19,9 @@ from itertools import pairwise
 from typing import Any
 
 from estimator.compilation.simd import number_rows
-from estimator.engine import source_cache as stored
 from estimator.engine.expected_update import input_history_rows, input_polynomial
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import integrator_rows
 from estimator.models.model import Model
 
@@ -73,7 +73,7 @@ def compile_noise_free_response(model: Model, degree: int = 0, lag: int = 0, lan
     names += [f"A_{i}_{j}" for i in model.states for j in model.states]
     layout = number_rows(*names, *integrator_rows(model))
     key = repr((coarse.digest, degree, lag, lanes))
-    code = stored.load_generated(
+    code = load_generated(
         model.name, "motion", key, lambda: _source(coarse, degree, lag, lanes, layout), RUNTIME_FUNCTIONS
     )
     return NoiseFreeResponse(

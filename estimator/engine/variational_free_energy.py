@@ -7,7 +7,7 @@ from typing import Any
 
 from estimator.compilation.elementary_functions import LOG_2PI, gamma_half_ratio, log, log1p
 from estimator.compilation.scalar_jit import scalar_jit
-from estimator.engine import source_cache as stored
+from estimator.engine.source_cache import load_generated
 from estimator.models.model import Model
 
 
@@ -98,4 +98,4 @@ def compile_free_energies(
     names = {"NAN": float("nan"), "LOG_2PI": LOG_2PI, "log": log}
     names |= {f.__name__: f for f in (precision_divergence, half_noise_powers)}
     key = repr((model.digest, iterations, lanes, sorted(layout.items()), every_iteration))
-    return stored.load_generated(model.name, "free-energy", key, make, names).free_energies
+    return load_generated(model.name, "free-energy", key, make, names).free_energies

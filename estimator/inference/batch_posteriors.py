@@ -16,11 +16,12 @@ from estimator.belief import Belief
 from estimator.compilation.simd import LANES, kernel
 from estimator.engine import kernels
 from estimator.engine.storage_layout import belief_rows
-from estimator.inference import DEFAULT_ITERATIONS, mean_field
+from estimator.inference import mean_field
 from estimator.inference.input_interpolation import input_stencil, record_lengths, rig_input_degree
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
 from estimator.support.argument_checks import to_float_array
+from estimator.support.update_options import DEFAULT_ITERATIONS
 
 
 def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | None = None) -> list[Belief]:

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel, number_rows
-from estimator.engine import source_cache as stored
 from estimator.engine.input_hold import compile_input_writer, input_degree
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import input_rows
 from estimator.models.model import Model
 from estimator.support.argument_checks import to_float_array
@@ -90,7 +90,7 @@ def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
             "sense", [("S", shown)], {"SHOWN": "S"}, layout, 1, doc="The sensor."
         )
 
-    code = stored.load_generated(model.name, "free-run", repr((model.digest, degree)), make, RUNTIME_FUNCTIONS)
+    code = load_generated(model.name, "free-run", repr((model.digest, degree)), make, RUNTIME_FUNCTIONS)
     move, sense, size, steps, n = code.move, code.sense, len(layout), model.substeps, len(model.names)
     shown, continuous = layout["SHOWN"], model.is_continuous
     feed = compile_input_writer(model, degree, [layout[row] for row in input_rows(model, degree)], 1)

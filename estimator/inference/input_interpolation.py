@@ -12,8 +12,9 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.models.model import Model
-from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
+from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
 
 #: Inputs that the look-ahead interpolation passes through: the last nine, and the next.

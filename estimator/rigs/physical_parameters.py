@@ -109,8 +109,8 @@ def _evaluate(function: Any, points: FloatArray, step: float) -> FloatArray:
 
 @cache
 def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
-    """Functions of all coefficients (or parameters) and the step: values of a map, and its derivatives."""
-    from estimator.engine import source_cache
+    """Values and slopes of a map between coefficients and parameters, as functions of all of them and the step."""
+    from estimator.engine.source_cache import load_generated
 
     mapped = getattr(model, direction)
     names = list(model.coefficients if direction == "physical" else model.physical)
@@ -130,5 +130,5 @@ def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
         return source
 
     functions = {name: getattr(np, name) for name in GENERATED_FUNCTIONS}
-    code = source_cache.load_generated(model.name, direction, model.digest, make, functions)
+    code = load_generated(model.name, direction, model.digest, make, functions)
     return code.values, code.slopes

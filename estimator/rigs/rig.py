@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
+from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
+from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.rigs.channel import Channel
 from estimator.rigs.rig_toml import rig_file_text
@@ -25,9 +27,6 @@ from estimator.support.argument_checks import (
     short_repr,
 )
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
-
-#: Interpolation of the input between samples, to the degree of its polynomial.
-INTERPOLATION_DEGREES = {"zero_order": 0, "linear": 1, "look_ahead": 5, "spline": 5}
 
 #: Interpolations that allow a fractional delay.
 FRACTIONAL_DELAY_INTERPOLATIONS = ("zero_order", "linear", "spline")

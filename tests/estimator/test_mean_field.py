@@ -77,7 +77,9 @@ def test_free_energy_falls_and_bounds_the_surprise_where_the_first_order_is_exac
         prediction = theta @ prior.mean[:2] + eta * u
         y = rng.normal(prediction[0], std[0])
         trace = updated(block_of([prior.to_record()], u, y, 1), 10, pieces=ONE)
-        assert np.diff(trace).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
+        assert (
+            np.diff(trace).max() <= 1e-12
+        )  # some twenty terms, each of them to 5e-14 as `test_elementary_functions` has it
         density = norm.pdf(y, prediction, std)
         evidence, error = density.mean(), density.std() / np.sqrt(DRAWS)
         assert trace[-1] >= -np.log(evidence) - 5 * error / evidence

@@ -61,8 +61,8 @@ def test_log_uniform_moments_have_converged(spread, monkeypatch):
     # A c δ as large as m makes the coefficients as nonlinear as they get.
     center = Parameters({**OSCILLATOR, "c": OSCILLATOR.m / SILVERBOX_SAMPLING_STEP})
     mean, cov = log_uniform_moments(PAPER, center, spread)
-    monkeypatch.setattr(module, "_NODES", 25)
-    monkeypatch.setattr(module, "_POINTS", 25**4)
+    monkeypatch.setattr(module, "_MAX_NODES_PER_AXIS", 25)
+    monkeypatch.setattr(module, "_MAX_NODES", 25**4)
     finer_mean, finer_cov = log_uniform_moments(PAPER, center, spread)
     deviations = np.sqrt(np.diag(finer_cov))
     assert np.abs((mean - finer_mean) / deviations).max() < 1e-10

@@ -1,4 +1,4 @@
-"""What `agents.policies.networks.rollout_features` makes of an observation of Eq. (2), with matrices, one observation after the other.
+"""The features of `agents.policies.networks.rollout_features` for Eq. (2), with matrices, one observation at a time.
 
 The motion is x⁺ = θ·φ with φ = (x, x³, x₋, u); the sensor shows x.
 """

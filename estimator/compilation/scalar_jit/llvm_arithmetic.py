@@ -61,7 +61,7 @@ class LlvmArithmetic:
         self.lines: list[str] = []
         self.count = 0
 
-    def op(self, result_type: str, text: str) -> Scalar:
+    def emit(self, result_type: str, text: str) -> Scalar:
         """Write a line that makes a value."""
         self.count += 1
         self.lines.append(f"%v{self.count} = {text}")
@@ -70,7 +70,7 @@ class LlvmArithmetic:
     def unary(self, operator: ast.unaryop, value: Any) -> Any:
         """A sign or ``not``."""
         if isinstance(operator, ast.Not):
-            return self.op("i1", f"xor i1 {self.truth(value)}, true")
+            return self.emit("i1", f"xor i1 {self.truth(value)}, true")
         if not isinstance(operator, ast.USub) or (isinstance(value, Scalar) and value.llvm_type in ("i1", "ptr")):
             raise TypeError(
                 f"{self.name} changes the sign of something that is not a number; negate numbers with a minus"
@@ -78,8 +78,8 @@ class LlvmArithmetic:
         if is_number(value):
             return -value
         if value.llvm_type == "double":
-            return self.op("double", f"fneg {FMA_FLAG} double {value.text}")
-        return self.op(value.llvm_type, f"sub i64 0, {value.text}")
+            return self.emit("double", f"fneg {FMA_FLAG} double {value.text}")
+        return self.emit(value.llvm_type, f"sub i64 0, {value.text}")
 
     def binary(self, operator: ast.operator, a: Any, b: Any) -> Any:
         """Arithmetic of two values."""
@@ -93,11 +93,11 @@ class LlvmArithmetic:
             x.llvm_type if isinstance(x, Scalar) else self.scalar(x).llvm_type if is_float(x) else "" for x in (a, b)
         }
         if operation in (ast.BitAnd, ast.BitOr) and operand_types == {"i1"}:
-            return self.op("i1", f"{_INTEGER_OPERATIONS[operation]} i1 {a.text}, {b.text}")
+            return self.emit("i1", f"{_INTEGER_OPERATIONS[operation]} i1 {a.text}, {b.text}")
         if operation is ast.Div or "double" in operand_types:
             if operation not in _FLOAT_OPERATIONS:
                 raise TypeError(f"{operation.__name__} of floats stands in {self.name}")
-            return self.op(
+            return self.emit(
                 "double", f"{_FLOAT_OPERATIONS[operation]} {FMA_FLAG} double {self.double(a)}, {self.double(b)}"
             )
         result_type = "word" if "word" in operand_types else "i64"
@@ -108,7 +108,7 @@ class LlvmArithmetic:
             raise TypeError(
                 f"{self.name} has {operation.__name__} of {sorted(operand_types - {''})}; convert one, or use jit"
             )
-        return self.op(result_type, f"{name} i64 {self.integer(a)}, {self.integer(b)}")
+        return self.emit(result_type, f"{name} i64 {self.integer(a)}, {self.integer(b)}")
 
     def compare(self, comparison: type[ast.cmpop], a: Any, b: Any) -> Scalar:
         """The truth of a comparison, which does not hold with NaN but for ``!=``."""
@@ -118,9 +118,9 @@ class LlvmArithmetic:
         if all(x.llvm_type in ("i64", "word") if isinstance(x, Scalar) else not is_float(x) for x in (a, b)):
             is_word = any(isinstance(x, Scalar) and x.llvm_type == "word" for x in (a, b))
             sign = "" if predicate in ("eq", "ne") else "u" if is_word else "s"
-            return self.op("i1", f"icmp {sign}{predicate} i64 {self.integer(a)}, {self.integer(b)}")
+            return self.emit("i1", f"icmp {sign}{predicate} i64 {self.integer(a)}, {self.integer(b)}")
         nan_prefix = "u" if predicate == "ne" else "o"
-        return self.op("i1", f"fcmp {FMA_FLAG} {nan_prefix}{predicate} double {self.double(a)}, {self.double(b)}")
+        return self.emit("i1", f"fcmp {FMA_FLAG} {nan_prefix}{predicate} double {self.double(a)}, {self.double(b)}")
 
     def select(self, condition: str, a: Any, b: Any) -> Scalar:
         """The first of two values where something is true, else the second."""
@@ -128,19 +128,19 @@ class LlvmArithmetic:
         if is_tuple(a) or is_tuple(b):
             raise TypeError(f"{self.name} chooses between tuples; choose between their parts")
         if a.llvm_type == b.llvm_type:
-            return self.op(
+            return self.emit(
                 a.llvm_type,
                 f"select i1 {condition}, {LLVM_TYPES[a.llvm_type]} {a.text}, {LLVM_TYPES[b.llvm_type]} {b.text}",
             )
-        return self.op("double", f"select i1 {condition}, double {self.double(a)}, double {self.double(b)}")
+        return self.emit("double", f"select i1 {condition}, double {self.double(a)}, double {self.double(b)}")
 
     def truth(self, value: Any) -> str:
         """A value as a truth."""
         if is_number(value):
             return "true" if value else "false"
         if value.llvm_type == "double":
-            return self.op("i1", f"fcmp {FMA_FLAG} une double {value.text}, 0.0").text
-        return str(value.text) if value.llvm_type == "i1" else self.op("i1", f"icmp ne i64 {value.text}, 0").text
+            return self.emit("i1", f"fcmp {FMA_FLAG} une double {value.text}, 0.0").text
+        return str(value.text) if value.llvm_type == "i1" else self.emit("i1", f"icmp ne i64 {value.text}, 0").text
 
     def convert(self, to_type: str, value: Any) -> Scalar:
         """A value as a number of another kind."""
@@ -148,7 +148,7 @@ class LlvmArithmetic:
             return Scalar(to_type, self.double(value))
         if is_number(value) or value.llvm_type != "double":
             return Scalar(to_type, self.integer(value))
-        return self.op(to_type, f"{'fptosi' if to_type == 'i64' else 'fptoui'} double {value.text} to i64")
+        return self.emit(to_type, f"{'fptosi' if to_type == 'i64' else 'fptoui'} double {value.text} to i64")
 
     def double(self, value: Any) -> str:
         """A value as a double."""
@@ -157,7 +157,7 @@ class LlvmArithmetic:
         if value.llvm_type == "double":
             return str(value.text)
         conversion = {"i1": "uitofp i1", "i64": "sitofp i64", "word": "uitofp i64"}[value.llvm_type]
-        return self.op("double", f"{conversion} {value.text} to double").text
+        return self.emit("double", f"{conversion} {value.text} to double").text
 
     def integer(self, value: Any) -> str:
         """A value as a whole number."""
@@ -165,7 +165,7 @@ class LlvmArithmetic:
             return str(int(value))
         if is_number(value) or value.llvm_type == "double":
             raise TypeError(f"a whole number is needed in {self.name}, and not a float")
-        return self.op("i64", f"zext i1 {value.text} to i64").text if value.llvm_type == "i1" else str(value.text)
+        return self.emit("i64", f"zext i1 {value.text} to i64").text if value.llvm_type == "i1" else str(value.text)
 
     def scalar(self, number: Any) -> Scalar:
         """A number as a value."""

@@ -55,7 +55,7 @@ class FunctionSource:
         code = self.function.__code__
         tree = _functions_by_line(self._text).get(code.co_firstlineno)
         if tree is None or tree.name != self.function.__name__:
-            raise TypeError(f"{self.name} is not defined in {code.co_filename}; use straight_within its source")
+            raise TypeError(f"{self.name} is not defined in {code.co_filename}; use scalar_jit_from_source")
         return tree
 
     @property
@@ -222,7 +222,7 @@ class FunctionTranslation(LlvmArithmetic):
                 case ast.Expr():
                     self._value(statement.value, names)
                 case _:
-                    raise self._error(statement, "stands in no straight function")
+                    raise self._error(statement, "cannot stand in a scalar_jit function")
         return None
 
     def _assign(self, target: ast.expr, value: Any, names: dict[str, Any]) -> None:
@@ -287,7 +287,7 @@ class FunctionTranslation(LlvmArithmetic):
                 base = self._value(node.value, names)
                 if is_tuple(base):
                     return base[self._value(node.slice, names)]
-                return self.op("double", f"load double, ptr {self._address(node, names)}, align 8")
+                return self.emit("double", f"load double, ptr {self._address(node, names)}, align 8")
             case ast.UnaryOp():
                 return self.unary(node.op, self._value(node.operand, names))
             case ast.BinOp():
@@ -295,7 +295,7 @@ class FunctionTranslation(LlvmArithmetic):
             case ast.BoolOp():
                 word = "and" if isinstance(node.op, ast.And) else "or"
                 parts = [Scalar("i1", self.truth(self._value(part, names))) for part in node.values]
-                return reduce(lambda a, b: self.op("i1", f"{word} i1 {a.text}, {b.text}"), parts)
+                return reduce(lambda a, b: self.emit("i1", f"{word} i1 {a.text}, {b.text}"), parts)
             case ast.Compare(ops=[order], comparators=[right]):
                 return self.compare(type(order), self._value(node.left, names), self._value(right, names))
             case ast.IfExp():
@@ -305,7 +305,7 @@ class FunctionTranslation(LlvmArithmetic):
                 return self.select(self.truth(truth), self._value(node.body, names), self._value(node.orelse, names))
             case ast.Call():
                 return self._call(node, names)
-        raise self._error(node, "stands in no straight function")
+        raise self._error(node, "cannot stand in a scalar_jit function")
 
     def _address(self, node: ast.Subscript, names: Mapping[str, Any]) -> str:
         """Where the entry of a block lies."""
@@ -316,7 +316,7 @@ class FunctionTranslation(LlvmArithmetic):
         if is_number(at) and at < 0:
             raise self._error(node, "counts from the end")
         index = self.integer(at)
-        return self.op("ptr", f"getelementptr inbounds double, ptr {base.text}, i64 {index}").text
+        return self.emit("ptr", f"getelementptr inbounds double, ptr {base.text}, i64 {index}").text
 
     def _call(self, node: ast.Call, names: Mapping[str, Any]) -> Any:
         """The value of a call."""
@@ -326,7 +326,7 @@ class FunctionTranslation(LlvmArithmetic):
             value, kind = self._value(node.func.value, names), _CONVERSIONS.get(self._value(node.args[0], names))
             if not isinstance(value, Scalar) or kind is None or value.llvm_type in ("i1", "ptr"):
                 raise self._error(node, "views something else than the bits of a number")
-            return self.op(kind, f"bitcast {LLVM_TYPES[value.llvm_type]} {value.text} to {LLVM_TYPES[kind]}")
+            return self.emit(kind, f"bitcast {LLVM_TYPES[value.llvm_type]} {value.text} to {LLVM_TYPES[kind]}")
         function, operands = self._value(node.func, names), [self._value(argument, names) for argument in node.args]
         source = getattr(function, "source", None)
         if isinstance(source, FunctionSource):
@@ -339,10 +339,10 @@ class FunctionTranslation(LlvmArithmetic):
         if function in _CONVERSIONS and len(operands) == 1:
             return self.convert(_CONVERSIONS[function], operands[0])
         if function in _FUNCTIONS and len(operands) == 1:
-            return self.op(
+            return self.emit(
                 "double", f"call {FMA_FLAG} double @{_FUNCTIONS[function]}(double {self.double(operands[0])})"
             )
-        raise self._error(node, "calls what is not straight")
+        raise self._error(node, "calls a function that scalar_jit cannot compile")
 
     def _call_on_block(self, function: Any, operands: Sequence[Any]) -> None:
         """Call a function of blocks, which is one of its own for LLVM too, and leaves its results in them."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from estimator.rigs.rig import INTERPOLATION_DEGREES
+from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.support.array_types import FloatArray
 
 #: Longest sample [steps]: the substeps of the integration are chosen for a length of 1.

@@ -113,12 +113,16 @@ def test_the_digest_of_sources_covers_each_of_them(tmp_path):
 
 
 def test_code_depends_on_its_package_and_those_below():
-    root = Path(simd.__file__).parents[1]
-    names = {name: [folder.name for folder in simd.source_folders(str(root / name))] for name in (
-        "estimator/engine/printer_numba.py", "duffing_env/kernel.py", "agents/planning/receding_horizon.py", "benchmarks/component_timing.py",
-    )}  # fmt: skip
+    root = Path(simd.__file__).parents[2]
+    files = (
+        "estimator/engine/printer_numba.py",
+        "duffing_env/kernel.py",
+        "agents/planning/receding_horizon.py",
+        "benchmarks/component_timing.py",
+    )
+    names = {file: [folder.name for folder in simd.source_folders(str(root / file))] for file in files}
     below = ["estimator", "duffing_env", "agents"]
-    assert list(names.values()) == [below[:1], below[:2], below, [*below, "benchmarks"]]
+    assert list(names.values()) == [below[:1], below[:2], below, [*below, "research", "benchmarks"]]
 
 
 def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
@@ -126,7 +130,8 @@ def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
         "from estimator.compilation.simd import jit\n\n@jit\ndef f():\n    return 1\n"
     )
     (tmp_path / "kernel_of_lanes.py").write_text(
-        "from estimator.compilation.simd import kernel\nfrom scalar_of_lanes import f\n\n@kernel\ndef run():\n    return f()\n"
+        "from estimator.compilation.simd import kernel\nfrom scalar_of_lanes import f\n\n"
+        "@kernel\ndef run():\n    return f()\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     digest = simd.source_digest.__wrapped__
@@ -170,7 +175,7 @@ def test_functions_that_differ_have_names_that_differ():
 
 
 def test_functions_within_functions_are_named_apart():
-    """Those of two kinds would have one name, and the linker would take one for the other (`estimator.compilation.simd.jit_closure`)."""
+    """Two variants of one name would be one function for the linker (`estimator.compilation.simd.jit_closure`)."""
     root = Path(__file__).parents[2]
     unnamed = []
 
@@ -182,7 +187,7 @@ def test_functions_within_functions_are_named_apart():
                 unnamed.extend(f"{name}: {child.name}" for decorator in names if decorator in ("jit", "kernel"))
             look(child, within or is_function, name)
 
-    for path in [p for package in ("estimator", "duffing_env", "agents") for p in (root / package).rglob("*.py")]:
+    for path in [p for package in ("estimator", "duffing_env", "agents", "research") for p in (root / package).rglob("*.py")]:
         if path.parent.name == "__pycache__":  # generated
             continue
         look(ast.parse(path.read_text(encoding="utf-8")), False, path.name)

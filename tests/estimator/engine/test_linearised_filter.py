@@ -152,7 +152,7 @@ def pieces_of(case, name, monkeypatch):
     if name in ("paper", "pendulum"):
         return adjoint.compile_adjoint(case.model, case.degree)
     with monkeypatch.context() as plain:
-        plain.setattr("estimator.engine.source_cache.part", lambda _: lambda function: function)
+        plain.setattr("estimator.engine.source_cache.jit_closure", lambda _: lambda function: function)
         plain.setattr("estimator.engine.source_cache.scalar_jit_from_source", lambda _: lambda function: function)
         return adjoint.compile_adjoint.__wrapped__(case.model, case.degree)
 

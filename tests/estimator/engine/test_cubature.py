@@ -8,7 +8,7 @@ from engine_cases import CASES, Case, assert_agrees, block, get_belief, put_beli
 from reference.filters import EPS, Plant
 from reference.structured import update
 from tables import table
-from test_structured_generated import LANES, some_samples, updated
+from test_gaussian_update import LANES, some_samples, updated
 
 from estimator.engine import kernels
 from estimator.engine.cubature import PIVOT_TOLERANCE

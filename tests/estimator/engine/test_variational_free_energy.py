@@ -10,7 +10,7 @@ from reference.mean_field import expected_log_gaussian, expected_log_normal, gam
 from reference.structured import update
 from scipy.linalg import block_diag
 from scipy.stats import norm
-from test_structured_generated import LANES, some_samples, updated
+from test_gaussian_update import LANES, some_samples, updated
 
 from estimator.engine import kernels
 from estimator.engine.variational_free_energy import compile_free_energies
@@ -118,7 +118,9 @@ def test_it_never_rises_and_bounds_the_surprise():
     W = updated(case, task, samples)
     free_energy(W, found.ravel())
     for out, density in zip(found.T, densities, strict=False):
-        assert np.diff(out).max() <= 1e-12  # some twenty terms, each of them to 5e-14 as `test_elementary` has it
+        assert (
+            np.diff(out).max() <= 1e-12
+        )  # some twenty terms, each of them to 5e-14 as `test_elementary_functions` has it
         evidence, error = density.mean(), density.std() / np.sqrt(draws)
         assert out[-1] >= -np.log(evidence) - 5 * error / evidence
     # With equal priors E[w²] = E[v²] for every sample, so that E[γ] = E[ξ] for ever: docs/evidence/coverage.md.
