@@ -22,7 +22,8 @@ from agents.planning.d_optimality import NominalSystem
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator.engine.input_hold import input_degree
-from estimator.inference.fisher_information import fisher_information, noise_variances
+from estimator.inference.fisher_information import fisher_information
+from estimator.inference.record_filter import noise_variances
 from estimator.models.difference_equation import difference
 from estimator.support.array_types import FloatArray
 from estimator.support.file_io import write_atomically

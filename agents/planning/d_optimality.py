@@ -39,7 +39,7 @@ class NominalSystem(NamedTuple):
     Attributes:
         coefficients: (K,) the model's.
         precision: (K, K) Λ.
-        noises: variances of the process noise and of each sensor's (`estimator.inference.fisher_information.noise_variances`).
+        noises: variances of the process noise and of each sensor's (`estimator.inference.record_filter.noise_variances`).
     """
 
     coefficients: FloatArray

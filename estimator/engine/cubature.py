@@ -20,16 +20,24 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine import symbolic
-from estimator.engine.gaussian_update import HALF, ONE, ZERO, select
 from estimator.engine.storage_layout import cubature_order
-from estimator.engine.symbolic import Assignments, Propagation, differentiate, substitute, symbol, symmetric_entry
+from estimator.engine.symbolic import (
+    HALF,
+    ONE,
+    ZERO,
+    Assignments,
+    Propagation,
+    differentiate,
+    is_negative,
+    select,
+    substitute,
+    symbol,
+    symmetric_entry,
+)
 from estimator.models.model import Model
 
 #: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
 PIVOT_TOLERANCE = 1e-14
-
-#: 1 for what is negative or no number, else 0.
-is_negative = sp.Function("below")
 
 
 def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:

@@ -138,7 +138,6 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     import sympy as sp
 
     from estimator.engine import printer_numba, symbolic
-    from estimator.engine.gaussian_update import select
     from estimator.engine.ldl import ldl_factorise
 
     symbol, names = symbolic.symbol, list(model.coefficients)
@@ -170,8 +169,10 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     lines += [("NOW", now.determinant), ("RATIO", with_future.determinant / symbol("NOW"))]
     ratio = symbol("RATIO")
     # `log` is that of positive, normal numbers; comparisons with NaN do not hold.
-    known = select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
-    known = select(symbol("NOW"), select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)), sp.Float(DIVERGED_SCORE))
+    known = symbolic.select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
+    known = symbolic.select(
+        symbol("NOW"), symbolic.select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)), sp.Float(DIVERGED_SCORE)
+    )
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
     source = printer_numba.print_lane_loop(

@@ -21,32 +21,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import sympy as sp
 
+from estimator.engine.noise_iterations import iterate_noise_beliefs
 from estimator.engine.printer_numba import print_expression
 from estimator.engine.symbolic import (
+    ONE,
+    ZERO,
     Assignments,
     Program,
     Propagation,
+    clip,
     differentiate,
     input_at_end,
+    is_present,
+    positive_part,
+    select,
     symbol,
     symmetric_entry,
 )
 from estimator.models.model import Model
 
-ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
-
 #: What rounding may change a variance by, in parts of its terms: 64 times 2⁻⁵³, for sums of d² = 36 or so products.
 ROUNDING = 2.0**-47
-
-#: 1 where a number is there and 0 where it is NaN; and the second of three where the first is positive, else the third.
-is_present, select = sp.Function("present"), sp.Function("select")
-
-#: A number, or 0 where it is negative; and the first of three, or whichever of the others it lies beyond. NaN stays.
-positive_part, clip = sp.Function("rectified"), sp.Function("clip")
 
 
 class GaussianUpdate:
@@ -252,7 +250,7 @@ def belief_update(
         output_noise = g.assign(f"N{tag}", g.output_process_noise(output_slope)) if k in informative_sensor else ZERO
         is_observed = g.assign(f"Z{tag}", is_present(y)) if may_be_missing else ONE
         e = g.assign(f"E{tag}", select(is_observed, y - expected, ZERO) if may_be_missing else y - expected)
-        noise_iterations = _update_noises(g, tag, sensor, (s, e, output_noise, is_observed), iterations)
+        noise_iterations = iterate_noise_beliefs(g.lines, tag, sensor, (s, e, output_noise, is_observed), iterations)
         last = noise_iterations[-1]
         if output_noise != 0:
             noise_cross_cov = {i: sum((output_slope[b] * n for b, n in enumerate(row)), ZERO)
@@ -285,80 +283,6 @@ def belief_update(
                 traced |= {f"q_{i}": one.q, f"r_{i}": one.r}
             results |= {f"TRACE_{tag}_{what}": print_expression(value) for what, value in traced.items()}
     return g.lines, results | g.row_results()
-
-
-class NoiseIteration(NamedTuple):
-    """What an iteration assumes and finds, in symbols.
-
-    Attributes:
-        process_variance: E[w²] of unit process noise that it assumes, 1/E[γ].
-        q, r: variances of both noises in the output that it assumes.
-        weight, scaled_innovation: 1/S, and the innovation times it.
-        gamma_shape, gamma_rate, xi_shape, xi_rate: the beliefs that it finds.
-    """
-
-    process_variance: sp.Expr
-    q: sp.Expr
-    r: sp.Expr
-    inverse_innovation_cov: sp.Expr
-    scaled_innovation: sp.Expr
-    gamma_shape: sp.Expr
-    gamma_rate: sp.Expr
-    xi_shape: sp.Expr
-    xi_rate: sp.Expr
-
-
-def _update_noises(
-    g: GaussianUpdate, tag: str, sensor: str, scalars: tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr], iterations: int
-) -> list[NoiseIteration]:
-    """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
-
-    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
-    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
-    """
-    s, e, output_noise, is_observed = scalars
-    gamma_rate, xi_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
-    gamma_shape, xi_shape = symbol("GAMMA_SHAPE"), symbol(f"XI_SHAPE_{sensor}")
-    half_count = g.assign(f"U{tag}", HALF * is_observed)
-    new_gamma_shape = g.assign(f"F{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
-    new_xi_shape = g.assign(f"X{tag}", xi_shape + half_count)
-    # Divisions are dear, and every iteration has the same shapes.
-    inverse_gamma_shape = g.assign(f"V{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
-    inverse_xi_shape = g.assign(f"A{tag}", 1 / new_xi_shape)
-    process_variance = g.assign(f"B{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO
-    r = g.assign(f"R{tag}_0", xi_rate / xi_shape)
-    noise_iterations = []
-    for i in range(iterations):
-        q = g.assign(f"Q{tag}_{i}", output_noise * process_variance)
-        inverse_innovation_cov = g.assign(f"L{tag}_{i}", 1 / (s + q + r))
-        scaled_innovation = g.assign(f"J{tag}_{i}", e * inverse_innovation_cov)
-        square = g.assign(f"T{tag}_{i}", scaled_innovation**2)
-        new_gamma_rate, new_xi_rate = (
-            g.assign(
-                f"{letter}{tag}_{i}", rate + half_count * variance * (v * square + (1 - v * inverse_innovation_cov))
-            )
-            if v != 0
-            else rate
-            for letter, rate, variance, v in (("G", gamma_rate, process_variance, q), ("O", xi_rate, r, r))
-        )
-        noise_iterations.append(
-            NoiseIteration(
-                process_variance,
-                q,
-                r,
-                inverse_innovation_cov,
-                scaled_innovation,
-                new_gamma_shape,
-                new_gamma_rate,
-                new_xi_shape,
-                new_xi_rate,
-            )
-        )
-        process_variance = (
-            g.assign(f"B{tag}_{i + 1}", new_gamma_rate * inverse_gamma_shape) if output_noise != 0 else ZERO
-        )
-        r = g.assign(f"R{tag}_{i + 1}", new_xi_rate * inverse_xi_shape)
-    return noise_iterations
 
 
 def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:

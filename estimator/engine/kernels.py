@@ -220,12 +220,11 @@ def compile_linearised_filter(
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic, variational_rk4
-        from estimator.engine.gaussian_update import ONE
         from estimator.engine.linearised_filter import linearised_filter_step
 
         lines, propagation = symbolic.propagate_sample(model)
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
-        span = symbolic.symbol("SPAN") if variable_step else ONE
+        span = symbolic.symbol("SPAN") if variable_step else symbolic.ONE
         source = variational_rk4.print_integrator(model, degree, layout, lanes, sample_length=span)
         source += printer_numba.print_lane_loop("finish", lines + more, results, layout, lanes, doc="Predict and see.")
         return source + printer_numba.print_sample("sample(W)", model, "finish(W)")

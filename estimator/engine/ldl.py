@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import sympy as sp
 
-from estimator.engine.gaussian_update import select
-from estimator.engine.symbolic import Assignments, symbol
+from estimator.engine.symbolic import Assignments, select, symbol
 
 
 class LdlFactors(NamedTuple):

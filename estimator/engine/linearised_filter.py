@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sympy as sp
 
-from estimator.engine.gaussian_update import HALF, ZERO
 from estimator.engine.printer_numba import print_expression
 from estimator.engine.storage_layout import likelihood_rows
 from estimator.engine.symbolic import (
+    HALF,
+    ZERO,
     Assignments,
     Program,
     Propagation,

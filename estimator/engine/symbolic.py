@@ -26,6 +26,21 @@ from estimator.models.model import FUNCTIONS, MAX_POWER, Model, names_in_express
 
 Assignments = list[tuple[str, sp.Expr]]
 
+ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
+
+# Functions without branches, which `estimator.engine.printer_numba` writes out. NaN stays NaN, but in the first and third.
+
+#: ``is_present(x)``: 0 where x is NaN, else 1.
+is_present = sp.Function("present")
+#: ``select(x, a, b)``: a where x > 0, else b.
+select = sp.Function("select")
+#: ``is_negative(x)``: 1 where x is negative or NaN, else 0.
+is_negative = sp.Function("below")
+#: ``positive_part(x)``: x, or 0 where x is negative.
+positive_part = sp.Function("rectified")
+#: ``clip(x, low, high)``: x within these limits.
+clip = sp.Function("clip")
+
 
 class Program(Assignments):
     """Assignments that grow."""

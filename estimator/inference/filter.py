@@ -52,10 +52,9 @@ class Filter:
         records = member_priors(prior, settings.noise_hypotheses)
         members = len(records)
         self._loop = self._compile_loop(members)
-        size, lanes = len(prior.record), self._loop.lanes
+        lanes = self._loop.lanes
         blocks = -(-members // lanes)
         self._block = np.zeros((blocks, len(self._loop.layout) * lanes))
-        self._backup = np.empty((blocks, size * lanes))
         self._weights = self._initial_weights(records)
         self._begun = np.zeros(1)
         self._inputs = np.zeros(self.input_stencil.n_past + 1)
@@ -114,7 +113,7 @@ class Filter:
         self._inputs[-1] = u
         self._outputs[-1, 0] = y
         overflowed_at: int = self._loop.run(
-            self._block, self._backup, self._weights, self._begun, self._inputs, self._outputs,
+            self._block, self._weights, self._begun, self._inputs, self._outputs,
             self.input_stencil.stencil, self._stencil_sizes, self._walk, energies, forecasts,
         )  # fmt: skip
         return overflowed_at
@@ -137,7 +136,7 @@ class Filter:
         )
         outputs = np.concatenate([self._outputs[:-1], y])
         overflowed_at: int = self._loop.run(
-            self._block, self._backup, self._weights, self._begun, inputs, outputs,
+            self._block, self._weights, self._begun, inputs, outputs,
             self.input_stencil.stencil, self._stencil_sizes, self._walk, energies, forecasts,
         )  # fmt: skip
         if overflowed_at < 0:

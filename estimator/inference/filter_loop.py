@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from estimator.compilation.simd import LANES, jit_closure, kernel
+from estimator.compilation.array_operations import copy
+from estimator.compilation.simd import LANES, jit, jit_closure, kernel
 from estimator.engine import kernels
 from estimator.engine.source_cache import variant_digest
 from estimator.engine.storage_layout import belief_rows
@@ -29,11 +30,10 @@ class FilterLoop:
     """A compiled loop over samples, and its block.
 
     Attributes:
-        run: ``run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts)``, which
+        run: ``run(W, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts)``, which
             returns -1, or the number of the sample at which the numbers overflowed; then nothing has changed.
 
             - W: (blocks, rows * lanes), the members' systems one after the other.
-            - backup: (blocks, record * lanes), memory.
             - weights: (members,) of the hypotheses.
             - begun: (1,) 0 before the first sample ever.
             - inputs: those that still act, then a new one for each sample; the former are moved on.
@@ -136,7 +136,7 @@ def _compile_loop(
     update_block: Any,
     score_member: Any,
 ) -> Any:
-    """The loop of `FilterLoop.run` around an update ``update_block(W, before)`` and its ``score_member(W, j, before, values, forecasts)``.
+    """Compile `FilterLoop.run` around an update.
 
     Args:
         variant: names the compiled code; see `estimator.compilation.simd.jit_closure`.
@@ -144,61 +144,32 @@ def _compile_loop(
         layout: of the rows.
         lanes: systems in a block.
         scratch: numbers that ``update_block`` leaves in ``before`` for ``score_member``.
-        update_block: updates a block.
-        score_member: free energies and forecasts of a lane.
+        update_block: ``update_block(W, before)``: updates a block.
+        score_member: ``score_member(W, j, before, values, forecasts)``: free energies and forecasts of lane j.
     """
-    u_row = layout["U_0"] * lanes
-    y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
-    walks = tuple(layout[f"P_{c}_{c}"] * lanes for c in model.coefficients)
     sensors, is_single = model.n_outputs, lanes == 1
+    load_sample = _compile_sample_loader(variant, model, layout, lanes)
     record_length = len(belief_rows(model)) * lanes
 
-    @jit_closure(variant)
-    def load_sample(W, inputs, start, window, stencil, output, walk, changes):
-        if changes:
-            for c in range(len(walks)):
-                for j in range(lanes):
-                    W[walks[c] + j] += walk[c]
-        for i in range(len(stencil)):
-            value = 0.0
-            for w in range(window):
-                value += inputs[start + w] * stencil[i, w]
-            for j in range(lanes):
-                W[u_row + i * lanes + j] = value
-        for k in range(sensors):
-            for j in range(lanes):
-                W[y_row + k * lanes + j] = output[k]
-
-    @jit_closure(variant)
-    def copy_beliefs(kept, blocks):
-        """Copy the beliefs in some blocks to others."""
-        for b in range(len(blocks)):
-            for i in range(record_length):
-                kept[b, i] = blocks[b, i]
-
     @kernel(variant=variant)
-    def run(W, backup, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
+    def run(W, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
         stride, past, waits, fills = steps[0], steps[1], steps[2], steps[3]
         members, samples, iterations = len(weights), len(outputs) - waits, energies.shape[1]
         judged = energies.shape[0] > 0
-        window, changes = stencil.shape[1], walk[0] > 0.0
-        for c in range(1, len(walks)):
-            changes = changes or walk[c] > 0.0
         before = np.empty(scratch)
         single, shares = np.empty((members, iterations)), np.empty((members, iterations))
         predictions = np.empty((members, sensors, 2))
-        old_weights = np.empty(members)
-        for m in range(members):
-            old_weights[m] = weights[m]
+        old_weights, backup = np.empty(members), np.empty((len(W), record_length))
+        copy(old_weights, 0, weights, members)
+        _copy_beliefs(backup, W, record_length)
         first = 1 if waits and begun[0] == 0.0 else 0
         if fills and begun[0] == 0.0:
             for i in range(past):
                 inputs[i] = inputs[past]
-        copy_beliefs(backup, W)
-        bad = -1
+        overflowed_at = -1
         for t in range(first, samples):
             for b in range(len(W)):
-                load_sample(W[b], inputs, t * stride, window, stencil, outputs[t], walk, changes)
+                load_sample(W[b], inputs, t * stride, stencil, outputs[t], walk)
                 update_block(W[b], before)
                 for j in range(min(lanes, members - b * lanes)):
                     m = b * lanes + j
@@ -208,49 +179,110 @@ def _compile_loop(
                 for k in range(sensors):
                     forecasts[here, k, 0], forecasts[here, k, 1] = predictions[0, k, 0], predictions[0, k, 1]
             else:
-                for m in range(members):
-                    mark_diverged(single[m], predictions[m])
-                    for i in range(iterations):
-                        shares[m, i] = weights[m]
-                apply_switching(shares, single)
-                forecast_mixture(shares, predictions, forecasts[here])
-                reweight(shares, single, energies[here])
-                for m in range(members):
-                    weights[m] = shares[m, iterations - 1]
-            if not judged:
-                continue
-            whole = True
-            for i in range(iterations):
+                _weigh_members(weights, single, shares, predictions, energies[here], forecasts[here])
+            if judged:
                 if is_single:
-                    energies[here, i] = single[0, i]
-                whole = whole and np.isfinite(energies[here, i])
-            if not whole:
-                bad = t
-                break
-        if judged and bad < 0 and samples > first:
-            # What the last sample left is seen by no later free energy.
-            whole = False
-            for m in range(members):
-                finite = weights[m] > 0.0
-                for i in range(m % lanes, record_length, lanes):
-                    finite = finite and np.isfinite(W[m // lanes, i])
-                whole = whole or finite
-            if not whole:
-                bad = samples - 1
-        if bad >= 0:
-            copy_beliefs(W, backup)
-            for m in range(members):
-                weights[m] = old_weights[m]
+                    copy(energies[here], 0, single[0], iterations)
+                if not _all_finite(energies[here]):
+                    overflowed_at = t
+                    break
+        if judged and overflowed_at < 0 and samples > first and not _any_finite(W, weights, lanes, record_length):
+            overflowed_at = samples - 1
+        if overflowed_at >= 0:
+            _copy_beliefs(W, backup, record_length)
+            copy(weights, 0, old_weights, members)
             if fills and begun[0] == 0.0:
                 for i in range(past):
                     inputs[i] = 0.0
-            return bad
+            return overflowed_at
         for i in range(past):
             inputs[i] = inputs[i + samples]
         for i in range(waits):
             for k in range(sensors):
                 outputs[i, k] = outputs[i + samples, k]
         begun[0] = 1.0
-        return bad
+        return overflowed_at
 
     return run
+
+
+def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
+    """``load_sample(W, inputs, start, stencil, output, walk)``: the random walk, inputs and outputs before an update."""
+    u_row = layout["U_0"] * lanes
+    y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
+    variance_rows = tuple(layout[f"P_{c}_{c}"] * lanes for c in model.coefficients)
+    sensors = model.n_outputs
+
+    @jit_closure(variant)
+    def load_sample(W, inputs, start, stencil, output, walk):
+        walks = False
+        for c in range(len(variance_rows)):
+            walks = walks or walk[c] > 0.0
+        if walks:
+            for c in range(len(variance_rows)):
+                for j in range(lanes):
+                    W[variance_rows[c] + j] += walk[c]
+        for i in range(len(stencil)):
+            value = 0.0
+            for w in range(stencil.shape[1]):
+                value += inputs[start + w] * stencil[i, w]
+            for j in range(lanes):
+                W[u_row + i * lanes + j] = value
+        for k in range(sensors):
+            for j in range(lanes):
+                W[y_row + k * lanes + j] = output[k]
+
+    return load_sample
+
+
+@jit
+def _weigh_members(weights, single, shares, predictions, energies, forecasts):
+    """Weigh the members by a sample, and give the mixture's free energies and forecasts.
+
+    Args:
+        weights: (members,), updated.
+        single: (members, iterations) free energies of the members.
+        shares: (members, iterations), overwritten with the weights after each iteration.
+        predictions: (members, sensors, 2) means and variances.
+        energies: (iterations,) receives the free energies of the mixture.
+        forecasts: (sensors, 2) receives its means and variances.
+    """
+    members, iterations = single.shape
+    for m in range(members):
+        mark_diverged(single[m], predictions[m])
+        for i in range(iterations):
+            shares[m, i] = weights[m]
+    apply_switching(shares, single)
+    forecast_mixture(shares, predictions, forecasts)
+    reweight(shares, single, energies)
+    for m in range(members):
+        weights[m] = shares[m, iterations - 1]
+
+
+@jit
+def _all_finite(values):
+    """Whether all numbers are finite."""
+    finite = True
+    for i in range(len(values)):
+        finite = finite and np.isfinite(values[i])
+    return finite
+
+
+@jit
+def _any_finite(blocks, weights, lanes, record_length):
+    """Whether a member with weight has a finite belief: no free energy judges what the last sample left."""
+    found = False
+    for m in range(len(weights)):
+        finite = weights[m] > 0.0
+        for i in range(m % lanes, record_length, lanes):
+            finite = finite and np.isfinite(blocks[m // lanes, i])
+        found = found or finite
+    return found
+
+
+@jit
+def _copy_beliefs(target, source, record_length):
+    """Copy the beliefs of some blocks to others."""
+    for b in range(len(source)):
+        for i in range(record_length):
+            target[b, i] = source[b, i]

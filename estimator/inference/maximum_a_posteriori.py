@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine.input_hold import input_degree
-from estimator.inference.fisher_information import (
+from estimator.inference.record_filter import (
     filter_records,
     inputs_by_sample,
     noise_variances,

@@ -9,11 +9,10 @@ from tables import table
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
 from estimator.inference.fisher_information import (
     cramer_rao,
-    filter_records,
     fisher_information,
-    inputs_by_sample,
     relative_covariance,
 )
+from estimator.inference.record_filter import filter_records, inputs_by_sample
 from estimator.rigs.physical_parameters import coefficients_of
 
 Q, R = 5e-4, 3e-4

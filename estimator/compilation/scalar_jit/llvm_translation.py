@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import ast
-import builtins
 import hashlib
-import linecache
 import math
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, cached_property, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimator.compilation.scalar_jit.function_source import FunctionSource
 from estimator.compilation.scalar_jit.llvm_arithmetic import (
     FMA_FLAG,
     LLVM_TYPES,
@@ -26,65 +25,6 @@ from estimator.compilation.scalar_jit.llvm_arithmetic import (
 
 #: Kinds of arguments or results (`estimator.compilation.scalar_jit.llvm_arithmetic.Scalar`), and tuples of them.
 ArgumentTypes = tuple[Any, ...]
-
-
-class FunctionSource:
-    """A function's definition, and what its names stand for.
-
-    Args:
-        function: as Python defined it.
-        text: that was executed to define it; None where its file holds it.
-    """
-
-    def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
-        self.function = function
-        self.name = function.__qualname__
-        if text is None:
-            # The text as it is now, and not when it is compiled: the file may have changed then.
-            linecache.checkcache(function.__code__.co_filename)
-            text = "".join(linecache.getlines(function.__code__.co_filename))
-        self._text = text
-
-    @cached_property
-    def tree(self) -> ast.FunctionDef:
-        """The definition.
-
-        Raises:
-            TypeError: where the function's file does not hold it.
-        """
-        code = self.function.__code__
-        tree = _functions_by_line(self._text).get(code.co_firstlineno)
-        if tree is None or tree.name != self.function.__name__:
-            raise TypeError(f"{self.name} is not defined in {code.co_filename}; use scalar_jit_from_source")
-        return tree
-
-    @property
-    def arguments(self) -> list[str]:
-        """Names of the arguments."""
-        return list(self.function.__code__.co_varnames[: self.function.__code__.co_argcount])
-
-    def resolve(self, name: str) -> Any:
-        """What a name that is not local stands for.
-
-        Raises:
-            NameError: for one that stands for nothing, or for what a loop has assigned and forgotten.
-        """
-        free = self.function.__code__.co_freevars
-        if name in free:
-            return (self.function.__closure__ or ())[free.index(name)].cell_contents
-        if name in self.function.__code__.co_varnames or not (
-            name in self.function.__globals__ or hasattr(builtins, name)
-        ):
-            raise NameError(f"name {name!r} is not defined in {self.name}; assign it before, and not in a loop")
-        return self.function.__globals__.get(name, getattr(builtins, name, None))
-
-
-@cache
-def _functions_by_line(text: str) -> Mapping[int, ast.FunctionDef]:
-    """The definitions in a file's text, by their first lines."""
-    nodes = ast.walk(ast.parse(text))
-    found = [node for node in nodes if isinstance(node, ast.FunctionDef)]
-    return {min([node.lineno, *(d.lineno for d in node.decorator_list)]): node for node in found}
 
 
 class TranslatedFunction(NamedTuple):

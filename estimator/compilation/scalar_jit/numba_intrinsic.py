@@ -11,10 +11,10 @@ from llvmlite import binding, ir
 from numba import types
 
 from estimator.compilation.numba_internals import _Intrinsic, cgutils
+from estimator.compilation.scalar_jit.function_source import FunctionSource
 from estimator.compilation.scalar_jit.llvm_translation import (
     DECLARED_FUNCTIONS,
     ArgumentTypes,
-    FunctionSource,
     FunctionTranslation,
     TranslatedFunction,
     flat_types,

@@ -31,7 +31,7 @@ from estimator.identification.likelihood.fit_hypothesis import (
     LaplaceFits,
 )
 from estimator.identification.likelihood.identification_problem import FilterSamples, IdentificationProblem
-from estimator.inference.fisher_information import FilteredRecords, filter_records
+from estimator.inference.record_filter import FilteredRecords, filter_records
 from estimator.support.array_types import FloatArray
 
 #: Levenberg-Marquardt damping at the start of a fit.

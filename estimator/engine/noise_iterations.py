@@ -1,0 +1,83 @@
+"""Variational iterations over the Gamma beliefs of the process and measurement noise precisions, as assignments."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import sympy as sp
+
+from estimator.engine.symbolic import HALF, ZERO, Program, symbol
+
+
+class NoiseIteration(NamedTuple):
+    """What an iteration assumes and finds, in symbols.
+
+    Attributes:
+        process_variance: E[w²] of unit process noise that it assumes, 1/E[γ].
+        q, r: variances of both noises in the output that it assumes.
+        weight, scaled_innovation: 1/S, and the innovation times it.
+        gamma_shape, gamma_rate, xi_shape, xi_rate: the beliefs that it finds.
+    """
+
+    process_variance: sp.Expr
+    q: sp.Expr
+    r: sp.Expr
+    inverse_innovation_cov: sp.Expr
+    scaled_innovation: sp.Expr
+    gamma_shape: sp.Expr
+    gamma_rate: sp.Expr
+    xi_shape: sp.Expr
+    xi_rate: sp.Expr
+
+
+def iterate_noise_beliefs(
+    program: Program, tag: str, sensor: str, scalars: tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr], iterations: int
+) -> list[NoiseIteration]:
+    """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
+
+    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
+    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
+    """
+    s, e, output_noise, is_observed = scalars
+    gamma_rate, xi_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
+    gamma_shape, xi_shape = symbol("GAMMA_SHAPE"), symbol(f"XI_SHAPE_{sensor}")
+    half_count = program.assign(f"U{tag}", HALF * is_observed)
+    new_gamma_shape = program.assign(f"F{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
+    new_xi_shape = program.assign(f"X{tag}", xi_shape + half_count)
+    # Divisions are dear, and every iteration has the same shapes.
+    inverse_gamma_shape = program.assign(f"V{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
+    inverse_xi_shape = program.assign(f"A{tag}", 1 / new_xi_shape)
+    process_variance = program.assign(f"B{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO
+    r = program.assign(f"R{tag}_0", xi_rate / xi_shape)
+    noise_iterations = []
+    for i in range(iterations):
+        q = program.assign(f"Q{tag}_{i}", output_noise * process_variance)
+        inverse_innovation_cov = program.assign(f"L{tag}_{i}", 1 / (s + q + r))
+        scaled_innovation = program.assign(f"J{tag}_{i}", e * inverse_innovation_cov)
+        square = program.assign(f"T{tag}_{i}", scaled_innovation**2)
+        new_gamma_rate, new_xi_rate = (
+            program.assign(
+                f"{letter}{tag}_{i}", rate + half_count * variance * (v * square + (1 - v * inverse_innovation_cov))
+            )
+            if v != 0
+            else rate
+            for letter, rate, variance, v in (("G", gamma_rate, process_variance, q), ("O", xi_rate, r, r))
+        )
+        noise_iterations.append(
+            NoiseIteration(
+                process_variance,
+                q,
+                r,
+                inverse_innovation_cov,
+                scaled_innovation,
+                new_gamma_shape,
+                new_gamma_rate,
+                new_xi_shape,
+                new_xi_rate,
+            )
+        )
+        process_variance = (
+            program.assign(f"B{tag}_{i + 1}", new_gamma_rate * inverse_gamma_shape) if output_noise != 0 else ZERO
+        )
+        r = program.assign(f"R{tag}_{i + 1}", new_xi_rate * inverse_xi_shape)
+    return noise_iterations

@@ -1,0 +1,270 @@
+"""The linearised Kalman filter over whole records at known coefficients: likelihood, gradient and Fisher information.
+
+The records run side by side in SIMD lanes. `estimator.engine.linearised_filter` has the arithmetic of a sample.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.compilation.simd import jit, kernel
+from estimator.engine.kernels import compile_linearised_filter
+from estimator.engine.storage_layout import likelihood_rows
+from estimator.inference.input_interpolation import record_lengths
+from estimator.models.model import Model
+from estimator.support.argument_checks import to_float_array
+from estimator.support.array_types import FloatArray
+
+
+class FilteredRecords(NamedTuple):
+    """What `filter_records` adds up over n series.
+
+    Attributes:
+        loss: (n,) minus the log likelihood, up to a constant; zeros where no outputs are followed.
+        gradient: (n, K) its slope by the coefficients, likewise.
+        information: (n, K, K).
+        innovations_squared: (n,) Σ ν²/S, which is near the number of outputs where the noises are right.
+    """
+
+    loss: FloatArray
+    gradient: FloatArray
+    information: FloatArray
+    innovations_squared: FloatArray
+
+
+def inputs_by_sample(model: Model, u: FloatArray, degree: int = 0) -> FloatArray:
+    """(n, T, rows) what a model takes over each sample, of inputs (n, T) before which there were none.
+
+    The taps of a difference equation, newest first; or the polynomial of degree 0 (held) or 1 (from the input before).
+    """
+    before = [np.concatenate([np.zeros((len(u), lag)), u[:, : u.shape[1] - lag]], axis=1) for lag in range(3)]
+    if model.is_continuous and degree == 1:
+        return np.stack([before[1] + 0.0 * u, u - before[1]], axis=2)
+    return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # not a number beyond the end
+
+
+def filter_records(
+    model: Model,
+    coefficients: FloatArray,
+    inputs: FloatArray,
+    y: FloatArray | None,
+    noises: FloatArray,
+    initial_state_cov: FloatArray,
+    initial_state: FloatArray | float = 0.0,
+    sample_lengths: FloatArray | None = None,
+    forecasts: FloatArray | None = None,
+) -> FilteredRecords:
+    """Run the filter over n series.
+
+    Args:
+        model: the equation.
+        coefficients: (n, K) coefficients.
+        inputs: (n, T, rows) inputs of each sample (`inputs_by_sample`); a series ends before its first NaN.
+        y: (n, T, p) outputs, NaN where one is missing; None for the response without noise.
+        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor's.
+        initial_state_cov: (n_states, n_states) of the states at the start.
+        initial_state: (n, n_states) of the states at the start; at rest where it is 0.
+        sample_lengths: (n, T) length of each sample of a differential equation, in sampling steps; all 1 where it is None.
+        forecasts: (n, T, p, 2), to be filled with mean and variance of each output before it was seen.
+    """
+    k = model.n_coefficients
+    lengths = record_lengths(inputs[:, :, 0])
+    totals = np.zeros((len(inputs), len(likelihood_rows(model))))
+    initial_moments = np.empty((len(inputs), model.n_states + (model.n_states * (model.n_states + 1)) // 2))
+    initial_moments[:, : model.n_states], initial_moments[:, model.n_states :] = (
+        initial_state,
+        initial_state_cov[_upper_triangle(model.n_states)],
+    )
+    outputs = np.zeros((0, 0, 0)) if y is None else y
+    noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
+    degree = inputs.shape[2] - 1 if model.is_continuous else 0
+    variable_step = sample_lengths is not None
+    lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
+    forecast_array = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
+    run = compile_record_filter(model, degree, y is not None, variable_step)
+    run(coefficients, inputs, outputs, lengths_in_steps, lengths, initial_moments, noise_rows, totals, forecast_array)
+    information = np.empty((len(inputs), k, k))
+    upper = _upper_triangle(k)
+    information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
+    return FilteredRecords(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
+
+
+#: (rows, columns) of the upper triangle of a square matrix.
+_upper_triangle = cache(np.triu_indices)
+
+#: Variance of what a missing output would have shown, in parts of a sensor's.
+_MISSING_VARIANCE_FACTOR = 1e18
+
+#: Series that run side by side: one vector of the widest kind, because a fit has few.
+_FIT_LANES = 8
+
+
+class _RowOffsets(NamedTuple):
+    """How many moments of the state, coefficients, sensors and totals a loop has, and the first row of what it needs.
+
+    Where it has no such row, it is -1.
+    """
+
+    n_state_moments: int
+    n_coefficients: int
+    n_outputs: int
+    n_totals: int
+    coefficient: int
+    noise: int
+    input: int
+    sample_length: int
+    is_counted: int
+    first_total: int
+    output: int
+    predicted_output: int
+    predicted_variance: int
+
+
+# What does not depend on the model is compiled for all models at once, which takes as long as for one.
+
+
+@jit
+def _load_records(W, at, first, lanes, coefficients, lengths, initial_moments, noises):
+    """Lay the series from ``first`` on side by side; gives the length of the longest."""
+    W[:] = 0.0
+    longest = 0
+    for j in range(_FIT_LANES):
+        i = first + min(j, lanes - 1)  # a spare lane repeats the last one
+        longest = max(longest, lengths[i])
+        W[at.is_counted * _FIT_LANES + j] = 1.0
+        for c in range(at.n_coefficients):
+            W[(at.coefficient + c) * _FIT_LANES + j] = coefficients[i, c]
+        for c in range(at.n_state_moments):
+            W[c * _FIT_LANES + j] = initial_moments[i, c]
+        for c in range(1 + at.n_outputs):
+            W[(at.noise + c) * _FIT_LANES + j] = noises[i, c]
+    return longest
+
+
+@jit
+def _load_sample(W, at, first, lanes, t, inputs, y, sample_lengths, lengths, noises):
+    """Lay out the next sample of each."""
+    for j in range(_FIT_LANES):
+        i = first + min(j, lanes - 1)
+        is_active = t < lengths[i]
+        for c in range(inputs.shape[2]):
+            W[(at.input + c) * _FIT_LANES + j] = inputs[i, t, c] if is_active else 0.0
+        if at.sample_length >= 0:
+            W[at.sample_length * _FIT_LANES + j] = sample_lengths[i, t] if is_active else 1.0
+        if at.output >= 0:
+            is_complete = True
+            for c in range(at.n_outputs):
+                is_observed = is_active and not np.isnan(y[i, t, c])
+                is_complete = is_complete and is_observed
+                W[(at.output + c) * _FIT_LANES + j] = y[i, t, c] if is_observed else 0.0
+                W[(at.noise + 1 + c) * _FIT_LANES + j] = noises[i, 1 + c] * (
+                    1.0 if is_observed else _MISSING_VARIANCE_FACTOR
+                )
+            W[at.is_counted * _FIT_LANES + j] = 1.0 if is_complete else 0.0
+
+
+@jit
+def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
+    """Take what the sample gave: forecasts, and the totals of those whose last one it was."""
+    for j in range(lanes):
+        if at.output >= 0 and len(forecasts) and t < lengths[first + j]:
+            for c in range(at.n_outputs):
+                forecasts[first + j, t, c, 0] = W[(at.predicted_output + c) * _FIT_LANES + j]
+                forecasts[first + j, t, c, 1] = (
+                    W[(at.predicted_variance + c) * _FIT_LANES + j] + noises[first + j, 1 + c]
+                )
+        if t + 1 == lengths[first + j]:
+            for c in range(at.n_totals):
+                totals[first + j, c] = W[(at.first_total + c) * _FIT_LANES + j]
+            for c in range(at.first_total):  # it is over, and goes on at rest
+                W[c * _FIT_LANES + j] = 0.0
+
+
+@cache
+def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
+    """The compiled loop of `filter_records`, with totals (n, 2 + K + K (K + 1)/2) packed."""
+    linearised_filter = compile_linearised_filter(
+        model, degree, follows_outputs=follows_outputs, lanes=_FIT_LANES, variable_step=variable_step
+    )
+    sample, rows, size = linearised_filter.sample, linearised_filter.layout, len(linearised_filter.layout)
+    n, sensor = model.n_states, next(iter(model.outputs))
+    at = _RowOffsets(
+        n_state_moments=n + n * (n + 1) // 2,
+        n_coefficients=model.n_coefficients,
+        n_outputs=model.n_outputs,
+        n_totals=len(likelihood_rows(model)),
+        coefficient=rows[next(iter(model.coefficients))],
+        noise=rows["Q"],
+        input=rows["U_0"],
+        sample_length=rows["SPAN"] if variable_step else -1,
+        is_counted=rows["LIVE"],
+        first_total=rows["LOSS"],
+        output=rows[f"Y_{sensor}"] if follows_outputs else -1,
+        predicted_output=rows[f"SHOWN_{sensor}"] if follows_outputs else -1,
+        predicted_variance=rows[f"SPREAD_{sensor}"] if follows_outputs else -1,
+    )
+
+    @kernel(variant=f"{model.name}_{model.digest}_{degree}_{int(follows_outputs)}_{int(variable_step)}")
+    def run(points, inputs, y, spans, lengths, begin, noises, totals, forecasts):
+        W = np.empty(size * _FIT_LANES)
+        for first in range(0, len(inputs), _FIT_LANES):
+            lanes = min(_FIT_LANES, len(inputs) - first)
+            for t in range(_load_records(W, at, first, lanes, points, lengths, begin, noises)):
+                _load_sample(W, at, first, lanes, t, inputs, y, spans, lengths, noises)
+                sample(W)
+                _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts)
+
+    return run
+
+
+def noise_variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt.ArrayLike) -> FloatArray:
+    """(1 + p,) of the process noise, and of each sensor's, from standard deviations; (n, 1 + p) of a batch.
+
+    Raises:
+        ValueError: for one that is out of range, or a number of sensors that is not the model's.
+    """
+    process = to_float_array("process_noise", process_noise)
+    if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
+        raise ValueError(
+            f"process_noise must be 0 or more and finite, but is {process_noise!r}; pass a standard deviation"
+        )
+    stds = to_float_array("measurement_noise", measurement_noise)
+    if stds.ndim > 2 or (stds.ndim and stds.shape[-1] != model.n_outputs):
+        raise ValueError(
+            f"measurement_noise must be one number, or one for each of {list(model.outputs)}, but has shape "
+            f"{stds.shape}"
+        )
+    if not (np.all(stds > 0) and np.isfinite(stds).all()):
+        raise ValueError(
+            f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
+        )
+    try:
+        shape = np.broadcast_shapes(process.shape, stds.shape[:-1])
+    except ValueError:
+        sizes = process.shape, stds.shape[:-1]
+        raise ValueError(
+            f"process_noise and measurement_noise must be of as many records, but are of {sizes}"
+        ) from None
+    sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
+    return np.concatenate([np.broadcast_to(process, shape)[..., None], sensors], axis=-1) ** 2
+
+
+def outputs_by_sensor(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:
+    """Outputs (..., T, p) that go with inputs (..., T); the last axis may be left out for one sensor.
+
+    Raises:
+        ValueError: for another shape.
+    """
+    outputs = to_float_array("y", y)
+    if model.n_outputs == 1 and outputs.shape == inputs.shape:
+        outputs = outputs[..., None]
+    if outputs.shape != (*inputs.shape, model.n_outputs):
+        raise ValueError(
+            f"u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have "
+            f"{inputs.shape} and {outputs.shape}"
+        )
+    return outputs
