@@ -66,7 +66,7 @@ def updater(factorisation: str, iterations: int) -> Any:
         update, place = task.update, task.layout
     else:
         place = mean_field.mean_field_layout()
-        update = mean_field.compile_mean_field_loop(place)
+        update = mean_field.compile_mean_field_update(place)
     u, y = place["U_0"] * LANES, place["Y_y"] * LANES
 
     @kernel(variant=f"{model.digest}_{factorisation}_{iterations}")

@@ -1,9 +1,8 @@
-"""Online identification of a Duffing oscillator by free energy minimisation.
+"""Online identification of nonlinear systems by free energy minimisation.
 
-Useful alone, on any recorded input and output: it knows no environment and no policy.
+The package works on any recorded input and output, without environments and policies.
 
-What it offers is listed in ``__init__.pyi``. Each is imported when it is asked for: the environment needs the beliefs
-and the inference, and every worker process waits for what it imports.
+``__init__.pyi`` lists its names. Each is imported on first use, which keeps the start of worker processes short.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-# The names of `estimator`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
+# The names of `estimator`, for type checkers and for `__init__.py`, which imports each on first use.
 from .belief import Belief
 from .identification import identify
 from .identification.identification_result import Result

@@ -1,11 +1,11 @@
-"""The belief: one Gaussian over states and coefficients of a model, and Gamma densities of its noises' precisions."""
+"""The belief: a Gaussian over a model's states and coefficients, and Gamma densities of its noise precisions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from estimator.support.update_options import DEFAULT_ITERATIONS
 
 @cache
 def covariance_indices(model: Model) -> npt.NDArray[np.intp]:
-    """(d, d) places of the covariance's entries in a record, for d states and coefficients."""
+    """(d, d) indices of the covariance's entries in a record, for d states and coefficients."""
     d = len(model.names)
     places = np.empty((d, d), dtype=np.intp)
     upper = np.triu_indices(d)
@@ -31,18 +31,18 @@ def covariance_indices(model: Model) -> npt.NDArray[np.intp]:
 
 @cache
 def record_size(model: Model) -> int:
-    """Numbers in a record."""
+    """Number of entries in a record."""
     return len(belief_rows(model))
 
 
 def check_belief_record(argument_name: str, model: Model, record: FloatArray, eigenvalue_tolerance: float) -> None:
-    """Refuse numbers (size,) that are not a belief of a model.
+    """Check that a record (size,) is a belief of a model.
 
     Args:
-        argument_name: names them in the message.
-        model: whose belief.
+        argument_name: name of the record in messages.
+        model: the model.
         record: the numbers.
-        eigenvalue_tolerance: what may be left below zero of a covariance's eigenvalues, in units of its standard deviations.
+        eigenvalue_tolerance: largest magnitude of a negative eigenvalue of the correlations, per quantity [1].
 
     Raises:
         ValueError: for numbers that are not finite, or beyond 1e30 (of the covariance, shapes and rates: 1e60), whose
@@ -57,8 +57,8 @@ def check_belief_record(argument_name: str, model: Model, record: FloatArray, ei
     if (beyond := np.abs(record) > limit).any():
         place = int(np.argmax(beyond))
         raise ValueError(
-            f"{argument_name} must be within ±{limit[place]:g}, but {belief_rows(model)[place]} is {record[place]:g}; give "
-            "numbers near 1, by scales that fit"
+            f"{argument_name} must be within ±{limit[place]:g}, but {belief_rows(model)[place]} is {record[place]:g}; "
+            "choose scales that bring the numbers near 1"
         )
     noises = record[-2 - 2 * model.n_outputs :]
     if (noises <= 0).any():
@@ -79,18 +79,19 @@ def check_belief_record(argument_name: str, model: Model, record: FloatArray, ei
 class Belief:
     """A prior or posterior: q(states, coefficients) Gaussian, q(γ) and q(ξ) of each sensor Gamma.
 
-    A copy: later updates do not change it. A coefficient of variance 0 is known. γ is the precision of what a sample's
-    process noise alone does to the first sensor.
+    A belief is a copy: later updates do not change it. A coefficient of variance 0 is known. γ is the precision of the
+    first sensor's output under the process noise of one sample alone.
 
     Attributes:
-        model: whose states and coefficients these are.
-        record: (size,) the numbers, as `estimator.engine.storage_layout.belief_rows` orders them: means, the upper triangle of
-            the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in samples.
-        scales: what one inside is worth outside, for physical parameters.
-        factorisation: of the inference that made it; ``mean_field`` is the paper's.
+        model: the model of the states and coefficients.
+        record: (size,) the numbers in the order of `estimator.engine.storage_layout.belief_rows`: means, the upper
+            triangle of the covariance row by row, shape and rate of γ, then of each sensor's ξ. Time is counted in
+            samples.
+        scales: units of the record, for physical parameters.
+        factorisation: factorisation of the inference; ``mean_field`` is the paper's.
 
     Raises:
-        ValueError: naming the part, for a wrong size, numbers that are not finite, a covariance that is not positive
+        ValueError: naming the part, for a wrong size, a number that is not finite, a covariance that is not positive
             semi-definite, or a shape or rate that is not positive.
     """
 
@@ -115,9 +116,9 @@ class Belief:
         object.__setattr__(self, "record", record)
 
     def __repr__(self) -> str:
-        """On one line: the model, and what is believed of its coefficients."""
-        told = (f"{name} = {mean:.4g} ± {std:.2g}" for name, (mean, std) in self.coefficients().items())
-        return f"Belief({self.model.name}: {', '.join(told)})"
+        """One line with the model, and mean and standard deviation of its coefficients."""
+        estimates = (f"{name} = {mean:.4g} ± {std:.2g}" for name, (mean, std) in self.coefficients().items())
+        return f"Belief({self.model.name}: {', '.join(estimates)})"
 
     @classmethod
     def of(
@@ -127,17 +128,20 @@ class Belief:
         cov: npt.ArrayLike,
         gamma: tuple[float, float],
         xi: tuple[float, float] | Sequence[tuple[float, float]],
-        **others: Any,
+        *,
+        scales: Scales = VOLT_SCALES,
+        factorisation: str = "structured",
     ) -> Self:
-        """From moments.
+        """A belief with given moments.
 
         Args:
-            model: whose states and coefficients.
-            mean: (d,) of the states, then the coefficients.
+            model: the model of the states and coefficients.
+            mean: (d,) means of the states, then of the coefficients.
             cov: (d, d) their covariance.
             gamma: shape and rate of the process precision.
-            xi: shape and rate of the measurement precision; one pair for each sensor where there are several.
-            others: ``scales`` and ``factorisation``.
+            xi: shape and rate of the measurement precision; of several sensors, one pair for each.
+            scales: as for the class.
+            factorisation: as for the class.
 
         Raises:
             ValueError: as the class, or for shapes that do not fit.
@@ -156,17 +160,17 @@ class Belief:
                 f"gamma must be a pair, and xi one for each of {list(model.outputs)}, but are {short_repr(gamma)} and "
                 f"{short_repr(xi)}"
             )
-        # As correlations: rounding leaves a covariance near 0 in no proportion to itself.
+        # As correlations: the rounding error of a covariance near 0 exceeds the covariance.
         std = np.sqrt(np.abs(np.diag(second)))
         if np.any(np.abs(second - second.T) > 1e-9 * np.outer(std, std)):
             raise ValueError("cov must be symmetric; pass (C + C.T) / 2")
         record[:d] = first
         record[covariance_indices(model)] = second
         record[-len(noises) :] = noises
-        return cls(model, record, **others)
+        return cls(model, record, scales, factorisation)
 
     def __eq__(self, other: object) -> bool:
-        """Whether all numbers are the same, as Gymnasium's checker asks of two episodes of one seed."""
+        """Whether all numbers are equal, as Gymnasium's checker requires of two episodes of one seed."""
         if not isinstance(other, Belief):
             return NotImplemented
         return self._identity == other._identity and np.array_equal(self.record, other.record)
@@ -175,14 +179,14 @@ class Belief:
         return hash((self._identity, self.record.tobytes()))
 
     @property
-    def _identity(self) -> tuple[Any, ...]:
+    def _identity(self) -> tuple[str, Scales, str]:
         return (self.model.digest, self.scales, self.factorisation)
 
     def with_records(self, records: FloatArray) -> list[Self]:
-        """Beliefs of the same kind with other records (n, size), which must not be written to any more."""
+        """Beliefs with other records (n, size), which must not be written to later."""
         beliefs = []
         for record in records:
-            # Past the checks, which take as long as 20 steps of one of a thousand environments.
+            # Without the checks, which take as long as 20 steps of an environment.
             belief = object.__new__(type(self))
             belief.__dict__.update(self.__dict__)
             belief.__dict__["record"] = record
@@ -190,9 +194,9 @@ class Belief:
         return beliefs
 
     def with_factorisation(self, factorisation: str) -> Self:
-        """This belief as an inference of another factorisation begins with it.
+        """This belief as the prior of an inference with another factorisation.
 
-        In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are left out.
+        In ``mean_field``, the paper's, states, θ and η are independent: their cross-covariances are set to 0.
         """
         record, places, n = self.record.copy(), covariance_indices(self.model), self.model.n_states
         if factorisation == "mean_field":
@@ -207,7 +211,7 @@ class Belief:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the coefficients."""
+        """Names of the coefficients."""
         return tuple(self.model.coefficients)
 
     @property
@@ -263,7 +267,7 @@ class Belief:
         return dict(zip(self.names, zip(self.coefficients_mean.tolist(), stds, strict=True), strict=True))
 
     def entropy(self) -> float:
-        """Entropy of the coefficients in nats; NaN where their covariance is singular."""
+        """Entropy of the coefficients [nats]; NaN if their covariance is singular."""
         active, cov = self._uncertain_coefficients()
         sign, log_det = np.linalg.slogdet(cov)
         return float(0.5 * (len(active) * np.log(2 * np.pi * np.e) + log_det)) if sign > 0 else float("nan")
@@ -275,7 +279,7 @@ class Belief:
             coefficients: values (..., K), in the order of ``coefficients_mean``.
 
         Returns:
-            Log density in nats, of shape (...): a float for one point. NaN where the covariance is singular.
+            Log density [nats] of shape (...): a float for one point. NaN if the covariance is singular.
 
         Raises:
             ValueError: for a wrong shape, or values that are not finite.
@@ -298,15 +302,15 @@ class Belief:
         return float(value) if np.ndim(value) == 0 else value
 
     def _uncertain_coefficients(self) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        """The coefficients that are not known, and their covariance."""
+        """Indices of the coefficients with positive variance, and their covariance."""
         cov = self.coefficients_cov
         active = np.flatnonzero(np.diag(cov) != 0)
         return active, cov[np.ix_(active, active)]
 
     def physical(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (p,) and covariance (p, p) of the physical parameters, to first order; the coefficients without any.
+        """Mean (p,) and covariance (p, p) of the physical parameters, to first order, in the units of ``scales``.
 
-        In the units of ``scales``.
+        A model without physical parameters has its coefficients instead.
         """
         return propagate_to_physical(self.model, self.coefficients_mean, self.coefficients_cov, self.scales)
 
@@ -318,7 +322,7 @@ class Belief:
         return {name: (value, float(std), units[name]) for name, value, std in rows}
 
     def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Physical parameter to the central interval that holds it with a probability.
+        """Physical parameter to its central credible interval.
 
         Raises:
             ValueError: for a probability that is not between 0 and 1.

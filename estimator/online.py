@@ -24,6 +24,7 @@ from estimator.support.progress import show_progress
 from estimator.support.progress import show_progress as shown
 from estimator.support.update_options import DEFAULT_ITERATIONS
 
+#: Samples between two reports of progress.
 _SAMPLES_BETWEEN_REPORTS = 5_000
 
 
@@ -31,31 +32,30 @@ class OnlineEstimator:
     """Online identification of any model by free energy minimisation.
 
     Recorded u and y are paired by array index: ``update(u_t, y_t)`` takes the two values of sample t, and the rig says
-    which inputs act on y_t, and how. The prior is what is believed one sample before the first.
+    which inputs act on y_t, and how. The prior is the belief one sample before the first.
 
     Args:
-        model: `difference`, the paper's difference equation, where it is None; `duffing`, the physical equation; or any
+        model: `difference`, the paper's difference equation and the default; `duffing`, the physical equation; or any
             other `Model`.
-        prior: a `Belief` of the model before the first sample. Where it is None: `silverbox_prior` for the paper's
-            model, `recorded_prior` for other difference equations and for `duffing`; others need one.
-        rig: what the inputs do, or the name of a rig file. Where it is None: input linear between samples, or delay 1
-            for a difference equation. A rig with a guess brings model and prior along, and its noises are weighed
-            (``noise_hypotheses`` 7 and 7); its belief, which is wide, goes by ``sigma_points``. u, y and parameters are
-            in the prior's units.
+        prior: a `Belief` of the model before the first sample. The default is `silverbox_prior` for the paper's model
+            and `recorded_prior` for other difference equations and for `duffing`; other models need a prior.
+        rig: timing and interpolation of the inputs, or the name of a rig file. The default is a linear input between
+            samples, or delay 1 for a difference equation. A rig with a guess sets model and prior,
+            ``noise_hypotheses`` to (7, 7) and ``expectations`` to ``sigma_points``, since its prior is wide. u, y and
+            parameters are in the prior's units.
         factorisation: ``structured`` (states and coefficients jointly Gaussian) or ``mean_field`` (the paper's, for the
             paper's model).
-        iterations: variational iterations per sample, 1 to 100; 3 structured, 10 mean field where it is None.
+        iterations: variational iterations per sample, 1 to 100; by default 3 structured and 10 mean field.
         as_published: mean field with the two departures of the published run, to reproduce its numbers.
-        drift: lets the coefficients walk at random, to follow a system that changes: standard deviation of a
-            coefficient's step per sample, in parts of that of its prior. 0.01 forgets in several hundred samples.
-        expectations: what a step does to the Gaussian belief: ``first_order``, by the derivative at its mean; or
-            ``sigma_points``, by points that spread as the belief does, for beliefs that are wide. By default the
-            former, or the latter with a rig that brings the prior.
-        noise_hypotheses: number of ratios σ_w/σ_v to weigh by their evidence (`estimator.inference.noise_grid`), structured only.
-            With 1, the default, the ratio stays nearly what the priors of γ and ξ say. 9 resolve it; an odd number has
-            the priors' own ratio among them. Each is there at three levels: a sample costs three updates a hypothesis.
-            Two numbers, such as (5, 5), are values of σ_w and of σ_v, a factor of 3 apart, in all combinations: where
-            each may be wrong by itself, by 9 times for 5 values and 27 times for 7.
+        drift: random walk of the coefficients, to track a changing system: standard deviation of a coefficient's step
+            per sample, as a fraction of its prior standard deviation. 0.01 forgets in several hundred samples.
+        expectations: propagation of the Gaussian belief: ``first_order``, the default, by the derivative at its mean;
+            ``sigma_points``, for wide beliefs, by cubature points.
+        noise_hypotheses: number of ratios σ_w/σ_v, weighed by their evidence (`estimator.inference.noise_grid`),
+            structured only. With 1, the default, the ratio stays near the ratio of the priors of γ and ξ. 9 resolve it;
+            an odd number includes the priors' ratio. Each ratio takes three updates per sample, at three totals. Two
+            numbers, such as (5, 5), are the numbers of values of σ_w and of σ_v, a factor of 3 apart, in all
+            combinations, for noises that may each be wrong: by 9 times for 5 values and 27 times for 7.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.
@@ -142,15 +142,15 @@ class OnlineEstimator:
 
     @property
     def forecasts(self) -> FloatArray:
-        """(T, 2) mean and variance of each output of the last `run` before it was seen; NaN in mean field.
+        """(T, 2) predictive mean and variance of each output of the last `run`; NaN in mean field.
 
-        (T, sensors, 2) for several sensors, each given those before it of the same sample.
+        (T, sensors, 2) for several sensors, each given the sensors before it of the same sample.
         """
         return self._in_rig_units(self._forecasts, self.scales.output, self.scales.output**2)
 
     @property
     def noise_ratio(self) -> NoiseRatio:
-        """Posterior of the noises' ratio over the hypotheses, which says whether the data tells γ from ξ.
+        """Posterior of the noise ratio over the hypotheses, which shows whether the data distinguishes γ from ξ.
 
         Raises:
             ValueError: if ``noise_hypotheses`` is 1.
@@ -161,22 +161,21 @@ class OnlineEstimator:
 
     @property
     def lookahead(self) -> int:
-        """Samples that are used only when the next input is known: 1 where the rig looks ahead, else 0."""
+        """Number of samples that wait for a later input: 1 if the rig looks ahead, else 0."""
         return int(self._filter.input_stencil.lookahead)
 
     def update(self, u: float, y: float | npt.ArrayLike) -> None:
-        """Update the posterior with the sample (u, y); y holds a number for each sensor.
+        """Update the posterior with the sample (u, y); y has a number for each sensor.
 
         Raises:
-            ValueError: if u or y is not a finite number, or drives the belief out of the range of floating-point
-                numbers. The estimator is then as it was before.
+            ValueError: if u or y is not a finite number, or the belief overflows. The estimator is then unchanged.
         """
         if self._filter.input_stencil.needs_whole_record:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
         if self.model.n_outputs > 1:
             self.run(np.array([to_scalar("u", u)]), np.reshape(to_finite_series("y", y), (1, -1)))
             return
-        # What is two finite floats needs no further look: this is the inner loop of who takes samples one by one.
+        # Two finite floats need no further check: this is the inner loop of a user with single samples.
         if not (isinstance(u, float) and isinstance(y, float) and math.isfinite(u + y)):
             u, y = (
                 float(to_finite_series("u", [to_scalar("u", u)])[0]),
@@ -190,27 +189,27 @@ class OnlineEstimator:
         if not used:
             self._forecasts = forecasts[:0]
         else:
-            # What the last sample left is overwritten by the next one but not before that has gone well.
+            # The buffers of the sample before are reused, once this sample has succeeded.
             previous = self._free_energies, self._forecasts
             self._free_energies, self._forecasts = free_energies, forecasts
             fits = len(previous[0]) == 1 and len(previous[1]) == 1
             self._spare_buffers = previous if fits else (np.empty_like(free_energies), np.empty_like(forecasts))
 
     def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False, missing: bool = False) -> FloatArray:
-        """Update the posterior with T samples, in order. The same as `update` with each of them.
+        """Update the posterior with T samples, in order, as `update` does with each.
 
         Args:
             u: (T,) inputs.
-            y: (T,) outputs, paired with u by index; (T, sensors) where there are several.
-            progress: tell on stderr how far it is, where it takes more than 5 seconds.
-            missing: outputs that are NaN are missing: the state moves on, nothing is learned from them.
+            y: (T,) outputs, paired with u by index; (T, sensors) of several sensors.
+            progress: show the progress on stderr, if it takes more than 5 seconds.
+            missing: outputs that are NaN are missing: the state is predicted, and nothing is updated.
 
         Returns:
-            Free energy (T, iterations) of each sample after each iteration [nats]. A rig that looks ahead uses a sample
-            when the next input is known: then the rows begin with the sample that waited, if there was one.
+            Free energy (T, iterations) of each sample after each iteration [nats]. With a rig that looks ahead the rows
+            begin with the stored sample, if there is one, and the last sample is stored.
 
         Raises:
-            ValueError: as `update`; the estimator is then as it was before the first of the samples.
+            ValueError: as `update`; the estimator is then unchanged.
         """
         if missing and self.settings.factorisation == "mean_field":
             raise ValueError("missing must be False in mean field, which takes all outputs; use structured")
@@ -235,19 +234,18 @@ class OnlineEstimator:
         return free_energies[:used]
 
     def rewind(self) -> None:
-        """Forget where the system is and what drove it, keep what is known about it: for another record or pass."""
+        """Reset the state and the inputs, and keep coefficients and noises: for another record or pass."""
         self._filter.rewind()
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Everything that the future depends on, by name, copied; `estimator.save_estimator` writes it to a file."""
+        """The complete state of the estimator, by name, copied; `estimator.save_estimator` writes it to a file."""
         return self._filter.arrays()
 
     def restore(self, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        """Become what `arrays` said of another estimator with the same settings.
+        """Set the state to the `arrays` of another estimator with the same settings.
 
         Raises:
-            ValueError: naming the array that is missing, unknown, or none that such an estimator can have. The
-                estimator is then as it was before.
+            ValueError: naming the array, if it is missing, unknown or impossible. The estimator is then unchanged.
         """
         self._filter.restore(arrays)
 
@@ -259,14 +257,14 @@ class OnlineEstimator:
             y: (T,) or (T, sensors) outputs, paired with u by index; T >= 2.
 
         Returns:
-            Predictions in the shape of y: of a filter that follows the record. Those of the paper's model are made from
-            the last two outputs as measured, as the paper does, and the first two repeat y.
+            Predictions in the shape of y, by a filter along the record. The paper's model predicts from the last two
+            measured outputs, as in the paper, and its first two predictions repeat y.
         """
         u, outputs = self._checked_record(u, y, False, min_length=2)
         return self._in_rig_units(self._filter.predict(u, outputs), self.scales.output)
 
     def forecast(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Mean and variance of each output before it is seen, with the coefficients and noises fixed at their means.
+        """Predictive mean and variance of each output, with the coefficients and noises fixed at their means.
 
         Args:
             u: (T,) inputs.
@@ -285,11 +283,11 @@ class OnlineEstimator:
 
         Args:
             u: (T,) inputs.
-            y_init: the first outputs, which are given and start the run; between 2 and T of them. The paper's model
-                starts from the last two as measured, others from the state that a filter finds.
+            y_init: between 2 and T first outputs, from which the run starts. The paper's model starts from the last two
+                as measured, other models from a filter's state.
 
         Returns:
-            Simulated outputs (T,) or (T, sensors); inf or NaN from where the model diverges.
+            Simulated outputs (T,) or (T, sensors); inf or NaN after the model diverges.
         """
         u = to_finite_series("u", u) / self.scales.input
         outputs = self._checked_outputs("y_init", y_init, False)
@@ -320,11 +318,11 @@ class OnlineEstimator:
         return to_finite_series(name, flat, missing).reshape(shape) / self.scales.output
 
     def _in_rig_units(self, values: FloatArray, *scales: float) -> FloatArray:
-        """What the filter tells (T, sensors, ...), in the rig's units; (T, ...) of one sensor."""
+        """Results of the filter (T, sensors, ...) in the rig's units; (T, ...) of one sensor."""
         return (values[:, 0] if self.model.n_outputs == 1 else values) * np.array(scales)
 
     def _progress_ranges(self, samples: int, progress: bool) -> Iterator[tuple[int, int]]:
-        """Ranges that cover all samples; one range without progress, else many, which are told."""
+        """Ranges that cover all samples: one without progress, else many, with a report before each."""
         if not progress or self._filter.input_stencil.needs_whole_record:
             yield 0, samples
             return
@@ -336,13 +334,13 @@ class OnlineEstimator:
 
 def _overflow_message(place: int, u: float, y: object) -> str:
     return (
-        f"u and y must keep the belief finite, but near sample {place} (u = {u}, y = {y}) it overflowed; the estimator "
-        f"is unchanged: check the sample's scale, or use a prior nearer to the system"
+        f"u and y must keep the belief finite, but near sample {place} (u = {u}, y = {y}) it overflowed; check the "
+        f"sample's scale, or use a prior nearer to the system (the estimator is unchanged)"
     )
 
 
 def _checked_prior(model: Model, prior: Belief | None, settings: EstimatorSettings) -> Belief:
-    """The prior, or the model's own; in mean field without what that leaves out."""
+    """The given or the model's default prior, in the factorisation of the settings."""
     if prior is None:
         if model.name not in ("difference", "duffing"):
             raise ValueError(f"prior must be given for {model.name}; make one with estimator.priors.weak_prior")

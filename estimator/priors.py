@@ -1,4 +1,4 @@
-"""Priors: what is believed of a model's coefficients before the first sample."""
+"""Priors of a model's coefficients, states and noises."""
 
 from __future__ import annotations
 
@@ -25,27 +25,30 @@ from estimator.support.argument_checks import (
 )
 from estimator.support.array_types import FloatArray
 
-#: Points of the quadrature along each parameter, and over all together, at most: with 20 along each of four, moments
-#: converge to 1e-10 for every spread up to 0.999.
-_MAX_NODES_PER_AXIS, _MAX_NODES = 20, 160_000
+#: Upper limit of the quadrature nodes along each parameter. With 20 along each of four parameters, the moments converge
+#: to 1e-10 for every spread up to 0.999.
+_MAX_NODES_PER_AXIS = 20
 
-#: Smallest and largest standard deviation: its square is a rate, of which precisions are made.
+#: Upper limit of the quadrature nodes in all.
+_MAX_NODES = 160_000
+
+#: Smallest and largest standard deviation, in the unit of the quantity: the squares are rates of precisions.
 _STD_RANGE = 1e-60, 1e60
 
 
 def log_uniform_moments(
     model: Model, center: Mapping[str, float], spread: float, scales: Scales = VOLT_SCALES
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments of the coefficients of a plant known only up to a factor.
+    """Moments of the coefficients of a plant with log-uniform parameters.
 
     The physical parameters (the coefficients, where the model has none) are independent, each log-uniform on
-    [center (1 - spread), center (1 + spread)]. Integrated by tensor Gauss-Legendre quadrature over the logarithms.
+    [center (1 - spread), center (1 + spread)]. The integral is a tensor Gauss-Legendre quadrature over the logarithms.
 
     Args:
-        model: whose coefficients.
+        model: the model.
         center: parameter to its middle; of any sign, but not 0.
         spread: relative half-width of the intervals, in [0, 1).
-        scales: what one inside is worth.
+        scales: units of the parameters.
 
     Returns:
         Mean (K,) and covariance (K, K).
@@ -63,11 +66,11 @@ def log_uniform_moments(
     return mean.copy(), cov.copy()
 
 
-@lru_cache(maxsize=256)  # every environment, and every evaluation of one, asks for the same
+@lru_cache(maxsize=256)  # every environment and evaluation takes the same
 def _log_uniform_moments(
     model: Model, center: tuple[float, ...], spread: float, scales: Scales
 ) -> tuple[FloatArray, FloatArray]:
-    """The integral of `log_uniform_moments`, with the parameters in their order."""
+    """The integral of `log_uniform_moments`, with the parameters in the model's order."""
     names = list(model.physical or model.coefficients)
     nodes_per_axis = max(2, min(_MAX_NODES_PER_AXIS, int(_MAX_NODES ** (1 / len(names)) + 1e-9)))
     nodes, weights = np.polynomial.legendre.leggauss(nodes_per_axis)
@@ -81,15 +84,15 @@ def _log_uniform_moments(
 def gaussian_moments(
     model: Model, mean: Mapping[str, float], std: Mapping[str, float], scales: Scales = VOLT_SCALES
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments of the coefficients of a plant whose parameters are independent and Gaussian.
+    """Moments of the coefficients of a plant with independent Gaussian parameters.
 
-    Exact where the coefficients are linear in the parameters; else integrated by tensor Gauss-Hermite quadrature.
+    The integral is a tensor Gauss-Hermite quadrature, which is exact for coefficients linear in the parameters.
 
     Args:
-        model: whose coefficients.
+        model: the model.
         mean: parameter to its mean.
-        std: parameter to its standard deviation; 0 for one that is known.
-        scales: what one inside is worth.
+        std: parameter to its standard deviation; 0 for a known one.
+        scales: units of the parameters.
 
     Returns:
         Mean (K,) and covariance (K, K).
@@ -108,7 +111,7 @@ def gaussian_moments(
 
 
 def gauss_hermite(mean: float, std: float, nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Points and weights (nodes,) of the quadrature over a Gaussian."""
+    """Nodes and weights (nodes,) of the quadrature over a Gaussian."""
     points, weights = np.polynomial.hermite_e.hermegauss(nodes)
     return mean + std * points, weights / weights.sum()
 
@@ -116,14 +119,14 @@ def gauss_hermite(mean: float, std: float, nodes: int) -> tuple[FloatArray, Floa
 def quadrature_moments(
     model: Model, axes: Mapping[str, tuple[FloatArray, FloatArray]], scales: Scales
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (K,) and covariance (K, K) of the coefficients of a plant whose parameters are independent.
+    """Mean (K,) and covariance (K, K) of the coefficients of a plant with independent parameters.
 
-    Plain sums, because the last digits of a BLAS product depend on its number of threads.
+    The sums avoid BLAS, whose last digits depend on its number of threads.
 
     Args:
-        model: whose coefficients.
-        axes: parameter to the points and weights of a quadrature along it.
-        scales: what one inside is worth.
+        model: the model.
+        axes: parameter to the nodes and weights of a quadrature along it.
+        scales: units of the parameters.
     """
     grid = np.meshgrid(*(points for points, _ in axes.values()), indexing="ij")
     probabilities = np.ones(1)
@@ -146,21 +149,22 @@ def weak_prior(
     state_std: float | Sequence[float] = 1e-3,
     scales: Scales = VOLT_SCALES,
 ) -> Belief:
-    """A prior of given coefficients, with weak Gamma priors of the noises and the plant near rest.
+    """A prior of given coefficient moments, with weak Gamma priors of the noises and the plant near rest.
 
     Args:
-        model: whose coefficients.
-        mean: (K,) of the coefficients.
+        model: the model.
+        mean: (K,) means of the coefficients.
         cov: (K, K) their covariance.
-        process_noise: standard deviation, in the first sensor, of one sample's process noise, at which γ is centred.
+        process_noise: standard deviation at which γ is centred, of the first sensor's output by one sample's process
+            noise.
         measurement_noise: standard deviation at which ξ is centred: one number, or one for each sensor.
-        noise_shape: shape of the Gamma priors: 2 is worth four noises seen one by one. They never are, so that even
-            such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
+        noise_shape: shape of the Gamma priors: 2 is the information of four observed noises. Noises are never observed
+            alone, so that even such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
         state_std: standard deviation of the states about 0: one number, or one for each.
-        scales: what one inside is worth.
+        scales: units of the parameters.
 
     Raises:
-        ValueError: for a value out of its range, or as `Belief`.
+        ValueError: for a value out of its range, or as for `Belief`.
     """
     Model.require_model(model)
     check_number("process_noise", process_noise, *_STD_RANGE)
@@ -182,7 +186,7 @@ def weak_prior(
     return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=scales)
 
 
-#: The Silverbox circuit's m, c, a and b by each equation (``python -m duffing_env.plants.silverbox_twin`` identifies them).
+#: Equation to the Silverbox circuit's m, c, a and b (``python -m duffing_env.plants.silverbox_twin`` identifies them).
 _SILVERBOX_TWINS = {"difference": SILVERBOX_TWIN, "duffing": SILVERBOX_ODE_TWIN}
 
 
@@ -197,9 +201,9 @@ def silverbox_prior(
     """The prior of the environments: an oscillator near the Silverbox circuit, at rest.
 
     Args:
-        model: with the parameters m, c, a, and b unless it is linear; `difference`, the paper's, where it is None.
-        spread: m, c, a and b are log-uniform on the twin's times [1 - spread, 1 + spread]; in (0, 1).
-        process_noise: what a sample's process noise does to the output: standard deviation [V] at which γ is centred.
+        model: with the parameters m, c, a, and b unless it is linear; by default `difference`, the paper's.
+        spread: m, c, a and b are log-uniform on [1 - spread, 1 + spread] times the twin's values; in (0, 1).
+        process_noise: standard deviation [V] at which γ is centred, of the output by one sample's process noise.
         measurement_noise: standard deviation [V] at which ξ is centred.
         noise_shape: see `weak_prior`.
         state_std: standard deviation of the states about rest [V].
@@ -216,19 +220,19 @@ def silverbox_prior(
 
 
 def published_run_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
-    """The prior that the paper's published numbers were computed with (it differs from the paper's text).
+    """The prior of the paper's published numbers, which differs from the paper's text.
 
     Args:
-        nonlinear: else θ2 is known to be 0: the paper's FEM-LARX.
-        model: `difference("linear")`, which has no θ2; the paper's where it is None.
+        nonlinear: False fixes θ2 at 0: the paper's FEM-LARX.
+        model: `difference("linear")`, which has no θ2; by default the paper's model.
     """
     return _paper_prior(nonlinear, model, (2.0, 1e-2), (1e8, 1e3), (1e8, 1e1))
 
 
 def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Belief:
-    """The prior as the paper's section 4 states it; the state's, not given there, is that of the published run.
+    """The prior of the paper's section 4, with the state's prior from the published run.
 
-    Arguments as `published_run_prior`.
+    Arguments as for `published_run_prior`.
     """
     return _paper_prior(nonlinear, model, (1.0, 10.0), (1e3, 1e1), (1e8, 1e3))
 
@@ -236,7 +240,7 @@ def paper_text_prior(nonlinear: bool = True, model: Model | None = None) -> Beli
 def _paper_prior(
     nonlinear: bool, model: Model | None, eta: tuple[float, float], gamma: tuple[float, float], xi: tuple[float, float]
 ) -> Belief:
-    """Means of 1 (of the states 0) and variances of 10, but for η."""
+    """Means of 1 (0 for the states) and variances of 10, except for η."""
     model = difference() if model is None else Model.require_model(model)
     check_bool("nonlinear", nonlinear)
     mean, variance = np.ones(len(model.names)), np.full(len(model.names), 10.0)
@@ -254,14 +258,14 @@ def recorded_prior(
     measurement_noise: float = 1e-3,
     noise_shape: float = 2.0,
 ) -> Belief:
-    """A weak prior about the Silverbox twin, for recorded data that begin in motion: 0.1 V in every state.
+    """A weak prior about the Silverbox twin, for records that begin in motion: states have a deviation of 0.1 V.
 
     Args:
         model: `estimator.models.duffing.duffing` with any terms, or `estimator.models.difference_equation.difference`.
-        spread: relative standard deviation of stiffness, cubic, damping and gain; the offsets are 0 with one of 20 mV,
-            feedthrough and cubic damping (per sample) 0 with one of 0.1. Of a difference equation: standard deviation
-            of the coefficients of lags and inputs, which are centred on those of Eq. (2) where that has them; those of
-            products have 1 + spread about 0, an offset a tenth of it in volts.
+        spread: for `duffing`, relative standard deviation of stiffness, cubic, damping and gain; offsets have mean 0
+            and standard deviation 20 mV, feedthrough and cubic damping (per sample) 0 and 0.1. For a difference
+            equation, standard deviation of the coefficients of lags and inputs, centred on Eq. (2) or 0; products have
+            1 + spread about 0, an offset a tenth of spread in volts.
         process_noise: see `silverbox_prior`.
         measurement_noise: see `silverbox_prior`.
         noise_shape: see `weak_prior`.
@@ -282,7 +286,7 @@ def recorded_prior(
 
 
 def add_output_offset(model: Model, mean: FloatArray, cov: FloatArray) -> None:
-    """Let the first state be the displacement with its offset: of moments (d,) and (d, d), in place."""
+    """Add the output offset to the first state, in moments (d,) and (d, d), in place."""
     place = model.names.index("output_offset")
     mean[0] += mean[place]
     cov[0, :] += cov[place, :]
@@ -295,7 +299,7 @@ def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArr
     mean = np.array([main.get(name, 0.0) for name in model.coefficients])
     others = {"force": 0.0, "output_offset": 0.02, "cubic_damping": 0.1, "feedthrough": 0.1}
     cov = np.diag([(spread * main[name] if name in main else others[name]) ** 2 for name in model.coefficients])
-    if "force" in model.coefficients:  # stiffness y0 - gain u0, of independent u0 and y0
+    if "force" in model.coefficients:  # force = stiffness y0 - gain u0, with independent u0 and y0
         force, offset = (list(model.coefficients).index(name) for name in ("force", "output_offset"))
         cov[force, force] = (0.02 * main["stiffness"]) ** 2 + (0.02 * main["gain"]) ** 2
         cov[force, offset] = cov[offset, force] = main["stiffness"] * 0.02**2

@@ -1,4 +1,4 @@
-"""Estimators in one file, without pickle; nothing in a file is used before it was checked."""
+"""Saving and loading estimators, without pickle; a file is checked before its content is used."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from estimator.rigs.units import Scales
 from estimator.support.argument_checks import short_repr
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
-#: Raised when the content of the files changes.
+#: Version of the file format.
 FILE_FORMAT = 3
 
-#: No estimator needs more [bytes]; a file that claims more is refused before it is read.
+#: Upper limit of a file's size, packed and unpacked [bytes].
 _MAX_BYTES = 64 * 2**20
 
 
 def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
     """Write an estimator to one file, a NumPy archive, from which it continues bit by bit.
 
-    The free energies and forecasts of its last run are not kept.
+    The free energies and forecasts of the last run are not saved.
 
     Raises:
-        ValueError: for what is not an estimator, or no name of a file.
+        ValueError: for anything but an estimator, or a path that is no file name.
     """
     if not isinstance(estimator, OnlineEstimator):
         raise ValueError(f"estimator must be an OnlineEstimator, but is {short_repr(estimator)}")
@@ -53,16 +53,16 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
 
 
 def load_estimator(path: str | Path) -> OnlineEstimator:
-    """Read an estimator that `save_estimator` wrote.
+    """Read an estimator from a file of `save_estimator`.
 
     Raises:
-        ValueError: for a file that is damaged, of another kind, or of a format that this version does not know.
+        ValueError: for a file that is damaged, of another kind, or of another format.
         FileNotFoundError: if there is no such file.
     """
     place = check_readable_file(path, "path must be a file of save_estimator, identify --save or a run", _MAX_BYTES)
     try:
         return _estimator_from(_read_arrays(place))
-    except Exception as error:  # whatever the readers make of a foreign file
+    except Exception as error:  # the readers raise many kinds for a foreign file
         raise ValueError(
             f"path must be a whole file of save_estimator, identify --save or a run, but {place} is not "
             f"({type(error).__name__}: {error}); write it again"
@@ -80,7 +80,7 @@ def _read_arrays(path: Path) -> dict[str, Any]:
 
 
 def _estimator_from(arrays: dict[str, Any]) -> OnlineEstimator:
-    """The estimator that arrays describe."""
+    """The estimator of the arrays in a file."""
     text = arrays.pop("description")
     if text.dtype != np.uint8 or text.ndim != 1:
         raise ValueError("its description is of another version" if text.ndim == 0 else "its description is no text")

@@ -1,4 +1,4 @@
-"""How an online estimator learns: its options, checked."""
+"""Options of an online estimator, and their checks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from estimator.models.model import Model
 from estimator.support.argument_checks import check_bool, check_choice, check_integer, check_number
 from estimator.support.update_options import DEFAULT_ITERATIONS, EXPECTATIONS, MAX_ITERATIONS
 
-#: More ratios of the noises than data could tell apart; and of two numbers, more values of each than there are noises.
-_MAX_HYPOTHESES, _MAX_VALUES_PER_NOISE = 1000, 99
+#: Upper limit of the noise hypotheses in all.
+_MAX_HYPOTHESES = 1000
+
+#: Upper limit of the values of each noise in a grid of both.
+_MAX_VALUES_PER_NOISE = 99
 
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """How a filter learns: `estimator.OnlineEstimator` says what each option means."""
+    """Options of a filter; `estimator.OnlineEstimator` explains each."""
 
     factorisation: str = "structured"
     iterations: int = 3
@@ -29,7 +32,7 @@ class EstimatorSettings:
 
 
 def checked_settings(model: Model, settings: EstimatorSettings) -> EstimatorSettings:
-    """Settings that fit a model, checked.
+    """Check settings for a model, and convert their numbers.
 
     Raises:
         ValueError: naming the option, the value and the remedy.
@@ -48,12 +51,10 @@ def checked_settings(model: Model, settings: EstimatorSettings) -> EstimatorSett
             f"published run was mean field"
         )
     check_choice("expectations", settings.expectations, EXPECTATIONS[:1] if is_mean_field else EXPECTATIONS)
-    check_number(
-        "drift", settings.drift, 0, 1, "0 is a system that stays, and of one that walks faster nothing is known"
-    )
+    check_number("drift", settings.drift, 0, 1, "0 is for a system that does not change")
     if settings.drift and is_mean_field:
         raise ValueError(
-            f"drift must be 0 in mean field, which cannot follow, but is {settings.drift!r}; use structured"
+            f"drift must be 0 in mean field, which has no random walk, but is {settings.drift!r}; use structured"
         )
     return replace(
         settings,
@@ -67,7 +68,7 @@ def checked_settings(model: Model, settings: EstimatorSettings) -> EstimatorSett
 def checked_noise_hypotheses(
     noise_hypotheses: object, factorisation: str, model: Model, maximum: int = _MAX_HYPOTHESES
 ) -> NoiseGridSize:
-    """A number of noise hypotheses, or two, that fit factorisation and model, and are at most ``maximum``.
+    """Check one or two numbers of noise hypotheses for a factorisation and model; at most ``maximum`` in all.
 
     Raises:
         ValueError: naming the option, the value and the remedy.

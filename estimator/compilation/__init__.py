@@ -1,1 +1,1 @@
-"""Compiled code: across SIMD lanes, its own front end, and its cache on disk."""
+"""Compilation: SIMD lanes, branch-free scalar functions, and compiled code on disk."""

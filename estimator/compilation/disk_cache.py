@@ -1,7 +1,7 @@
-"""Compiled code on disk: read by whoever needs it next, made anew where it is damaged, left out where none can be kept.
+"""Cache of compiled code on disk: damaged files are compiled anew, and an unwritable disk is no error.
 
-It stands in place of Numba's own cache, whose index and data files are fatal where they are damaged, which refuses to
-work where nothing can be written, and which cannot see a bit that flipped.
+It replaces Numba's own cache, which raises for damaged files and for unwritable folders, and does not detect a flipped
+bit.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from estimator.support.file_io import write_atomically
 
 @cache
 def cache_folder() -> Path | None:
-    """Where generated and compiled code is kept; None, with one RuntimeWarning, where nothing can be written.
+    """Folder of generated and compiled code; None, with one RuntimeWarning, if no folder is writable.
 
-    ``NUMBA_CACHE_DIR`` where it is set; else ``__pycache__`` beside this file; else the user's cache folder.
+    The candidates are ``NUMBA_CACHE_DIR`` if it is set, else ``__pycache__`` beside this file; then the user's cache
+    folder.
     """
     for candidate in _candidate_folders():
         try:
@@ -65,30 +66,30 @@ def _candidate_folders() -> list[Path]:
 
 
 def write_cached(path: Path, content: bytes) -> None:
-    """Write a file in one piece; a full disk only costs the next process the time to make it again."""
+    """Write a file atomically; with a full disk the next process compiles again."""
     with suppress(OSError):
         write_atomically(path, content)
 
 
 class CompilationNotice(event.Listener):
-    """Watches over compilation: Numba tells when it begins and ends to compile a function.
+    """A notice on stderr, once per process, if compilation takes longer than `NOTICE_AFTER`.
 
-    What takes longer than `NOTICE_AFTER` says on stderr that it compiles, once in a process. Python's garbage collector
-    rests meanwhile: it looks through all that Numba builds, again and again, and finds nothing.
+    Python's garbage collector is off during compilation: it would scan all of Numba's objects again and again, and
+    free nothing.
 
     Args:
-        now: the time [s].
-        timer: makes what calls a function after so many seconds.
+        now: clock [s].
+        timer: ``timer(seconds, function, arguments)`` calls a function later, as `threading.Timer`.
     """
 
-    #: Seconds that the process may spend compiling before it says so.
+    #: Time of compilation before the notice [s].
     NOTICE_AFTER = 2.0
 
     def __init__(
         self, now: Callable[[], float] = time.perf_counter, timer: Callable[..., Any] = threading.Timer
     ) -> None:
         self._now, self._new_timer = now, timer
-        self._depth = 0  # a function that others call is compiled while they are
+        self._depth = 0  # called functions are compiled during the caller's compilation
         self._seconds_spent = 0.0
         self._started_at: float | None = None
         self._has_printed = False
@@ -96,10 +97,10 @@ class CompilationNotice(event.Listener):
         self._gc_was_enabled = False
 
     def on_start(self, event: Any) -> None:
-        """A function begins to be compiled."""
+        """Called when the compilation of a function begins."""
         dispatcher = event.data["dispatcher"]
         if self._depth == 0 and not isinstance(dispatcher._cache, DiskCache):
-            return  # somebody else's
+            return  # a function of another package
         self._depth += 1
         if self._depth > 1:
             return
@@ -113,7 +114,7 @@ class CompilationNotice(event.Listener):
             self._timer.start()
 
     def on_end(self, event: Any) -> None:
-        """A function is compiled, or cannot be."""
+        """Called when the compilation of a function ends or fails."""
         self._depth = max(0, self._depth - 1)
         if self._depth > 0 or self._started_at is None:
             return
@@ -134,21 +135,21 @@ class CompilationNotice(event.Listener):
 
 @cache
 def watch_compilation() -> None:
-    """Let a `CompilationNotice` watch from now on."""
+    """Register a `CompilationNotice` with Numba."""
     event.register("numba:compile", CompilationNotice())
 
 
 class DiskCache(_Cache):
-    """What Numba asks for compiled code of a function, and gives it to: one file per signature and processor.
+    """Numba's cache of a function, as one file per signature and processor.
 
-    A file begins with the stamp of the sources and the digest of the rest. Another stamp is another version of the
-    sources, whose code is made anew in silence; another digest is damage.
+    A file begins with the digest of the sources and the digest of the rest. Another digest of the sources is another
+    version, and the function is compiled again in silence; another digest of the rest is damage.
 
     Args:
-        function: whose code.
-        sources_digest: of the sources, 64 hexadecimal digits.
-        has_unique_name: whether its qualified name tells it from others that are defined at the same place. Otherwise what it
-            has from around does, which may differ between two processes; then it is compiled in both.
+        function: the function.
+        sources_digest: digest of the sources, 64 hexadecimal digits.
+        has_unique_name: whether the qualified name differs between functions of one definition. If not, the closure
+            identifies the function; a closure that differs between two processes is compiled in both.
     """
 
     def __init__(self, function: Callable[..., Any], sources_digest: str, has_unique_name: bool = False) -> None:
@@ -162,15 +163,15 @@ class DiskCache(_Cache):
 
     @property
     def cache_path(self) -> str | None:
-        """The folder; None where nothing can be written."""
+        """The folder; None if no folder is writable."""
         return None if cache_folder() is None else str(cache_folder())
 
     def enable(self) -> None:
-        """Use files."""
+        """Use the disk."""
         self._enabled = True
 
     def disable(self) -> None:
-        """Use no files."""
+        """Leave the disk alone."""
         self._enabled = False
 
     def flush(self) -> None:
@@ -180,7 +181,7 @@ class DiskCache(_Cache):
             path.unlink(missing_ok=True)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled function; None where there is none, or a damaged one."""
+        """The compiled function; None if there is no file, or a damaged one."""
         path = self._path(sig, target_context.codegen())
         try:
             content = path.read_bytes() if path is not None else b""
@@ -193,17 +194,17 @@ class DiskCache(_Cache):
             if hashlib.sha256(payload).hexdigest().encode() != digest:
                 raise ValueError("the digest is another")
             called, *reduced = pickle.loads(payload)
-            # All of Numba, which takes long to import, is needed only where the code calls what that brings.
+            # Loading all of Numba takes long, and is needed only if the code calls its functions.
             rtsys.initialize(target_context)
             if any(binding.address_of_symbol(name) is None for name in called):
                 target_context.refresh()
             return CompileResult._rebuild(target_context, *reduced)
-        except Exception:  # whatever a pickle raises
+        except Exception:  # a pickle may raise anything
             _warn_damaged(str(path.parent))
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled function, if it can be kept."""
+        """Write a compiled function, if it can be cached."""
         path = self._path(sig, data.codegen)
         if path is None or data.lifted or data.library.has_dynamic_globals:
             return
@@ -223,9 +224,9 @@ class DiskCache(_Cache):
 
 @cache
 def _warn_damaged(place: str) -> None:
-    """Once per process."""
+    """Warn of damage, once per folder and process."""
     warnings.warn(
-        f"compiled code in {place} is damaged, and is made anew; if this comes again, delete that folder",
+        f"compiled code in {place} is damaged, and is compiled anew; if this warning returns, delete that folder",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -1,8 +1,8 @@
-"""Elementary functions in the form the kernels need.
+"""Elementary and Gamma functions for compiled kernels.
 
-`log` and others that are `straight` are free of branches and calls, so that they vectorise. The Gamma functions are
-evaluated at the very large shapes of the paper's noise priors (1e8), where differences of library values would keep no
-digit of the divergence between a posterior and its prior.
+`log` and the others with `scalar_jit` are free of branches and calls, so that they vectorise. The Gamma functions keep
+their digits at the very large shapes of the paper's noise priors (1e8), where differences of library values lose all
+digits of the divergence between posterior and prior.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LN2_LOW = 1.90821492927058770002e-10
 
 @scalar_jit
 def _exponent_and_mantissa(x):
-    """The k and m with x = 2^k m and m in [sqrt(1/2), sqrt(2)), of a positive, normal number."""
+    """Exponent k and mantissa m of x = 2^k m and m in [sqrt(1/2), sqrt(2)), of a positive, normal number."""
     bits = np.float64(x).view(np.int64)
     k = (bits - _SQRT_HALF_BITS) >> _N_MANTISSA_BITS
     return k, np.int64(bits - (k << _N_MANTISSA_BITS)).view(np.float64)
@@ -45,7 +45,7 @@ def _log_from_parts(k, f):
 def log(x):
     """Natural logarithm of a positive, normal number, to 3 units in the last place.
 
-    Zero, infinities and NaN give a finite or NaN value without meaning.
+    The value for zero, infinities and NaN is meaningless.
     """
     k, m = _exponent_and_mantissa(x)
     return _log_from_parts(k, m - 1.0)
@@ -74,13 +74,13 @@ def log1p(x):
 
 @scalar_jit
 def gamma_half_ratio(a):
-    """The r and t with Γ(a + 1/2) / Γ(a) = exp(-t) / sqrt(r), of a > 0, to rounding up to a of 1e9 and more.
+    """Factors r and t of Γ(a + 1/2) / Γ(a) = exp(-t) / sqrt(r), a > 0, to rounding for a up to 1e9 and more.
 
     Ten steps of the recurrence, then the asymptotic series of Γ(a + 1/2) / Γ(a).
     """
     below = a * (a + 1.0) * (a + 2.0) * (a + 3.0) * (a + 4.0) * (a + 5.0) * (a + 6.0) * (a + 7.0) * (a + 8.0)
     above = (a + 0.5) * (a + 1.5) * (a + 2.5) * (a + 3.5) * (a + 4.5) * (a + 5.5) * (a + 6.5) * (a + 7.5) * (a + 8.5)
-    # Of a very large shape the products overflow, and are as good as equal.
+    # For a very large shape the products overflow; their ratio is 1.
     stepped = (above * (a + 9.5)) / (below * (a + 9.0)) if a < 1e30 else 1.0
     inverse = 1.0 / (a + 10.0)
     z = inverse * inverse
@@ -90,7 +90,7 @@ def gamma_half_ratio(a):
 
 @scalar_jit
 def log_gamma_half_ratio(a):
-    """Log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding also where both are of the order of 1e9."""
+    """Log Gamma(a + 1/2) - log Gamma(a) of a > 0, to rounding even if both are about 1e9."""
     r, t = gamma_half_ratio(a)
     return -0.5 * log(r) - t
 
@@ -99,8 +99,8 @@ def log_gamma_half_ratio(a):
 def gamma_update_divergence(shape, rate, rate_increment):
     """Divergence KL[Gamma(shape + 1/2, rate + increment) || Gamma(shape, rate)] in nats.
 
-    This is what one sample adds to the belief in a noise precision. Written in increment/rate, because rate +
-    increment has already rounded away most digits of the increment.
+    It is the divergence of a noise precision's belief by one sample. The formula is in increment/rate, since rate +
+    increment loses most digits of the increment.
     """
     ratio = rate_increment / rate
     return (
@@ -118,15 +118,15 @@ def expected_log_gamma(shape, rate):
 
 
 _TWO_OVER_PI = 2 / math.pi
-# π/2 in three parts (those of fdlibm). The first two have 33 bits, so that their products with a whole number of up to
-# 20 bits are exact, also on a processor that rounds a product before it is subtracted.
+# π/2 in the three parts of fdlibm. The first two have 33 bits, so that their products with an integer of up to 20 bits
+# are exact, with and without fused multiply-add.
 _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _ROUNDING_CONSTANT = 1.5 * 2.0**52
 
 
 @scalar_jit
 def _reduce_to_quarter_turn(x):
-    """The quarter turn nearest to x, as a whole number, and what is left of x, within ±π/4."""
+    """The nearest integer number of quarter turns in x, and the remainder of x, within ±π/4."""
     quarter = (x * _TWO_OVER_PI + _ROUNDING_CONSTANT) - _ROUNDING_CONSTANT
     return quarter, ((x - quarter * _HALF_PI[0]) - quarter * _HALF_PI[1]) - quarter * _HALF_PI[2]
 

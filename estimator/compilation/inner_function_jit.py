@@ -1,8 +1,7 @@
-"""What only compiled functions call: Numba only translates it, and what calls it is optimised as a whole.
+"""A faster Numba jit for functions with callers in compiled code only: translated to LLVM, optimised in the callers.
 
-For each function that it compiles Numba optimises what there is so far, makes machine code, and a wrapper for callers
-in Python. Of a function that is linked into others all that is done for nothing, or again: three fifths of the time
-that the planner's search takes to compile.
+Numba optimises every function by itself, and makes machine code and a wrapper for callers in Python. For a function
+that is linked into others this is unused or repeated work: three fifths of the compile time of the planner's search.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from estimator.compilation.numba_internals import (
 
 
 class InnerDispatcher(CPUDispatcher):
-    """A function as other compiled functions call it.
+    """A function for callers in compiled functions.
 
     Args:
-        function: to compile.
-        options: of Numba.
+        function: the function.
+        options: options of Numba.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -37,11 +36,11 @@ class InnerDispatcher(CPUDispatcher):
         super().__init__(function, targetoptions=target_options, pipeline_class=_InnerCompiler)
 
     def add_overload(self, cres: Any) -> None:
-        """Keep what is compiled for some types of arguments, where Python does not look for it."""
+        """Store a compiled overload, without an entry for calls from Python."""
         self.overloads[tuple(cres.signature.args)] = cres
 
     def _compile_for_args(self, *args: Any, **kwargs: Any) -> Any:
-        """What a call from Python goes to: for what is tried out or tested."""
+        """The function for calls from Python, in tests and experiments."""
         return self._standalone
 
     @cached_property
@@ -50,10 +49,10 @@ class InnerDispatcher(CPUDispatcher):
 
 
 class _InnerCompiler(CompilerBase):
-    """Numba's passes, but for how it makes code."""
+    """Numba's passes, with another lowering."""
 
     def define_pipelines(self) -> list[Any]:
-        """The one for code without Python's objects."""
+        """The pipeline for code without Python objects."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.passes = [(_InnerLowering if each is NativeLowering else each, name) for each, name in passes.passes]
         passes.finalize()
@@ -62,7 +61,7 @@ class _InnerCompiler(CompilerBase):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):
-    """Makes code, and lets Numba know what calls are linked to."""
+    """Lowers a function, and registers it for linking."""
 
     _name = "inner_lowering"
 
@@ -71,16 +70,16 @@ class _InnerLowering(NativeLowering):
         state.library = _UnoptimisedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
-        state["cr"] = state["cr"]._replace(cfunc=object())  # by which calls find it
+        state["cr"] = state["cr"]._replace(cfunc=object())  # callers find it by this
         state.targetctx.insert_user_function(state["cr"].cfunc, state["cr"].fndesc, [state.library])
         return True
 
 
 class _UnoptimisedLibrary(JITCodeLibrary):
-    """Code to link, which goes to no optimiser and to no compiler of machine code."""
+    """Code for linking only, without optimisation and machine code."""
 
     def _optimize_final_module(self) -> None:
-        """Left to what it is linked into."""
+        """Left to the callers' library."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()

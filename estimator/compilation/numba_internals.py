@@ -1,4 +1,4 @@
-"""What this project uses of Numba's insides, which may change with any version: the versions that it works with.
+"""Internals of Numba that this project uses, and the supported versions of Numba.
 
 Raises:
     ImportError: at import, with another version of Numba.
@@ -8,7 +8,7 @@ import numba
 
 if not (0, 60) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69):
     raise ImportError(
-        f"numba must be at least 0.60 and below 0.69, whose insides duffing-env uses, but is {numba.__version__}; "
+        f"numba must be at least 0.60 and below 0.69, whose internals duffing-env uses, but is {numba.__version__}; "
         "get one with: pip install 'numba>=0.60,<0.69'",
         name="numba",
     )

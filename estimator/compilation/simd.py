@@ -1,10 +1,10 @@
-"""Scalar mathematics, compiled to run across lanes.
+"""Compiling scalar functions across SIMD lanes, and the project's own variants of Numba's jit.
 
-The equations of this project are written once, as small scalar functions of named quantities. `lanewise` compiles
-such a function into a loop over `LANES` independent systems, so that the compiler turns every scalar operation into
-a vector operation. All quantities of these systems lie in one flat float64 array, the *block* ``W``: the quantity in
-row r of lane j is ``W[r * LANES + j]``. One array with constant offsets is what makes the loops vectorise: with an
-array per quantity the compiler cannot rule out that two of them overlap, and falls back to scalar code.
+The equations are written once, as small scalar functions of named quantities. `lanewise` compiles such a function into
+a loop over `LANES` independent systems, and the compiler turns every scalar operation into a vector operation. All
+quantities of these systems lie in one flat float64 array, the *block* ``W``: the quantity in row r of lane j is
+``W[r * LANES + j]``. The loops vectorise because of the constant offsets into one array: of separate arrays the
+compiler cannot rule out that they overlap.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from estimator.compilation.disk_cache import DiskCache
 from estimator.compilation.inner_function_jit import InnerDispatcher
 from estimator.compilation.scalar_jit import scalar_jit, scalar_jit_from_source
 
-#: Systems in a block. A multiple of the vector width (8 doubles in AVX-512); 32 lanes of ~120 rows stay within 32 KiB.
+#: Number of systems in a block: a multiple of the AVX-512 vector of 8 doubles, with some 120 rows in 32 KiB of cache.
 LANES = 32
 
-#: No division checks, fused multiply-adds allowed (nothing else: results must not depend on the order of lanes), and no
-#: wrapper for callers in C, which has no user and takes time to compile.
+#: Options of Numba: no checks of divisions, fused multiply-adds but no other reordering (results must not depend on the
+#: order of lanes), and no wrapper for callers in C, which has no user.
 NUMBA_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract"},
@@ -34,34 +34,37 @@ NUMBA_OPTIONS: dict[str, Any] = {
     "no_cfunc_wrapper": True,
 }
 
-#: Compile a function that other compiled functions call.
+#: Compile a function for callers in other compiled functions.
 jit = partial(InnerDispatcher, options=NUMBA_OPTIONS)
 
 
 def number_rows(*names_in_order: str, first_row: int = 0) -> dict[str, int]:
-    """Number the quantities named in ``names_in_order`` (space-separated names), from row ``first_row`` on."""
+    """Number quantities, given as space-separated names, from row ``first_row`` on.
+
+    Raises:
+        ValueError: for a name that occurs twice.
+    """
     names = " ".join(names_in_order).split()
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ValueError(f"groups must name every row once, but {repeated} stand there twice; rename them")
+        raise ValueError(f"names_in_order must have every row once, but has {repeated} twice; rename them")
     return {name: first_row + i for i, name in enumerate(names)}
 
 
 def lanewise(
     layout: Mapping[str, int], result_rows: str, uniform: str = "", lanes: int = LANES, single_lane: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a straight scalar function (`estimator.compilation.scalar_jit`) to run over all lanes of a block.
+    """Compile a branch-free scalar function (`estimator.compilation.scalar_jit`) to run over all lanes of a block.
 
-    The function's parameters are read from the rows of their names, its results are written to the rows named in
-    ``result_rows``. Parameters named in ``uniform`` are the same for all lanes, and become arguments of the loop after
-    the block: ``f(W, *uniform)``.
+    The loop reads each parameter from the row of its name, and writes the results to ``result_rows``. Parameters in
+    ``uniform`` are the same for all lanes, and become arguments of the loop: ``f(W, *uniform)``.
 
     Args:
         layout: name of a quantity to its row.
-        result_rows: the rows that the function returns, in its order, separated by spaces.
-        uniform: parameters that are not rows, in the order in which the loop takes them.
-        lanes: systems in the block.
-        single_lane: for one lane: ``f(W, j, *uniform)``.
+        result_rows: names of the rows of the results, in order, separated by spaces.
+        uniform: names of the parameters that are not rows, in the order of the loop's arguments.
+        lanes: lanes of the block.
+        single_lane: compile ``f(W, j, *uniform)`` for one lane j.
 
     Raises:
         ValueError: for a parameter that is neither a row nor uniform, or both.
@@ -79,12 +82,12 @@ def lanewise(
 
 
 def jit_single_lane(layout: Mapping[str, int], function: Callable[..., Any], lanes: int = LANES) -> Any:
-    """Compile ``f(W, j)``: what a scalar function, which may be anything that Numba compiles, gives in lane j.
+    """Compile ``f(W, j)``: the result of a scalar function, with any code that Numba compiles, in lane j.
 
     Args:
-        layout: name of a quantity to its row; the function's parameters are rows.
-        function: to compile.
-        lanes: systems in the block.
+        layout: name of a quantity to its row; every parameter is a row.
+        function: the scalar function.
+        lanes: lanes of the block.
 
     Raises:
         ValueError: for a parameter that is not a row.
@@ -103,15 +106,15 @@ def _argument_text(function: Callable[..., Any], layout: Mapping[str, int], unif
 
 
 def kernel(function: Callable[..., Any] | None = None, *, variant: str = "", **options: Any) -> Any:
-    """Compile an entry point: a function that Python calls, kept on disk (`estimator.compilation.disk_cache`).
+    """Compile an entry point: a function with callers in Python, cached on disk (`estimator.compilation.disk_cache`).
 
-    Numba's own cache knows when the file of the function changed, but not the files of the functions it calls; a stale
-    kernel would give wrong numbers in silence. So the stamp of ours is a digest of all our sources.
+    Numba's own cache misses changes in the files of called functions, and a stale kernel would give wrong numbers in
+    silence. So this cache has a digest of all sources.
 
     Args:
-        function: to compile.
+        function: the function.
         variant: see `jit_closure`.
-        options: of Numba.
+        options: further options of Numba.
     """
     if function is None:
         return partial(kernel, variant=variant, **options)
@@ -123,11 +126,10 @@ def kernel(function: Callable[..., Any] | None = None, *, variant: str = "", **o
 
 
 def jit_closure(variant: str) -> Any:
-    """Compile a function that is defined within another, and called by other compiled functions.
+    """Compile a function that is defined within another, for callers in compiled functions.
 
-    Never `jit`: compiled code is joined by names, and code from disk may have been compiled where another function had
-    this one's. ``variant`` tells it from the functions that the other defines at other times: the cache on disk, and the
-    linker where it joins what several processes compiled, go by names.
+    `jit` would be wrong: the linker and the disk cache identify functions by name, and all closures of one definition
+    have the same. ``variant`` is appended to the name, and must differ between closures with different values.
     """
     return lambda function: jit(_with_variant(function, variant))
 
@@ -137,12 +139,12 @@ def _with_variant(function: Callable[..., Any], variant: str) -> Callable[..., A
     return function
 
 
-#: The packages, each of which may use those before it.
+#: The packages; each imports only packages before it.
 _PACKAGES = ("estimator", "duffing_env", "agents", "research")
 
 
 def source_folders(file: str) -> tuple[Path, ...]:
-    """The folders of all that the code in a file may use: its package, and the packages below."""
+    """Folders of all code that a file may import: its package, and the packages below."""
     path, project_root = Path(file), Path(__file__).parents[2]
     package = path.relative_to(project_root).parts[0] if path.is_relative_to(project_root) else ""
     if package in _PACKAGES:
@@ -152,23 +154,23 @@ def source_folders(file: str) -> tuple[Path, ...]:
 
 @cache
 def source_digest(folders: tuple[Path, ...]) -> str:
-    """Of the sources in some folders."""
+    """Digest of the sources in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(folder.rglob("*.py")):
-            # What the engine generated stands there too, and follows from the rest.
+            # Generated source stands there too, and is a function of the rest.
             if path.parent.name != "__pycache__":
                 digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 def _define_function(source: str, function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
-    """Define the function written in ``source``, filed under the place of ``function``."""
+    """Define the function in ``source``, with the file and module of ``function``."""
     namespace: dict[str, Any] = dict(names)
     exec(compile(source, function.__code__.co_filename, "exec"), namespace)
     defined: Callable[..., Any] = namespace[function.__name__]
     defined.__module__ = function.__module__
     defined.__doc__ = function.__doc__
-    # One scalar function may have several loops, which must not share a name: see `jit_closure`.
+    # Several loops of one scalar function need different names: see `jit_closure`.
     defined.__qualname__ = f"{function.__qualname__}_{hashlib.sha256(source.encode()).hexdigest()[:12]}"
     return defined

@@ -1,5 +1,5 @@
-"""The engine: from a model's declaration to compiled kernels.
+"""The engine: compiled filters, predictions and gradients, generated from the equations of a model.
 
-`derive` does the calculus, `algebra` and `path` the filter, `emit` writes the source, `cache` keeps it, and `tasks` is
-what the rest of the project calls. SymPy is imported only where a source is generated for the first time.
+`symbolic` differentiates the model, `gaussian_update` and `linearised_filter` write the filter, `printer_numba` prints
+its source, `source_cache` keeps it on disk, and `kernels` compiles it. SymPy is imported only when source is generated.
 """

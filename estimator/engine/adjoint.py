@@ -1,12 +1,13 @@
-"""A path of one system and its reverse, for the gradient by the inputs: scalars in tuples, over many samples.
+"""Gradient of the predicted Fisher information with respect to the inputs, by the adjoint method, for one system.
 
-The same arithmetic as `estimator.engine.kernels.compile_linearised_filter` without outputs. Tuples, because what a sample begins with then
-stays in registers; a block in memory that is written and read again at once is two to three times slower.
+The arithmetic is `estimator.engine.kernels.compile_linearised_filter` without outputs. The quantities are scalars in
+tuples, which stay in registers: a block in memory takes two to three times as long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cache
 from itertools import combinations_with_replacement
 from typing import Any
@@ -17,38 +18,56 @@ from estimator.engine.storage_layout import filter_state_rows, input_rows, integ
 from estimator.models.model import Model
 
 
-@cache
-def compile_adjoint(model: Model, degree: int = 0) -> Any:
-    """Compiled functions of a path, along the response without noise.
+@dataclass(frozen=True)
+class Adjoint:
+    """Compiled functions of the linearised filter along the noise-free response, forward and backward.
 
-    P is the path: states, covariance V (upper triangle) and sensitivities Z (row by row); F the information's upper
-    triangle; C the coefficients, U the input over a sample, N the variances of the noises. G and H are the adjoints of
-    P and F. A tape (T, n_tape) keeps what samples begin with.
+    P is the filter's state: states, covariance (upper triangle) and sensitivities (row by row). F is the upper triangle
+    of the Fisher information, C the coefficients, U the input over a sample, N the noise variances. G and H are the
+    adjoints of P and F. A tape (T, n_tape) stores the start of every sample.
+
+    Attributes:
+        begin: ``begin(start)``: P from an array, and a zero F.
+        coefficients: ``coefficients(values)``: C from an array.
+        noises: ``noises(values)``: N from an array.
+        input_coefficients: ``input_coefficients(now, last, older)``: U from the inputs, newest first.
+        step: ``step(P, F, C, U, N, tape, t)``: P and F after sample t, and mean and variance of the first sensor.
+        add_information: ``add_information(F, precision, total)``: writes the lower triangle of Λ + F into ``total``.
+        seed_adjoint: ``seed_adjoint(inverse)``: a zero G, and H of J = ½ log det(Λ + F), from the inverse of Λ + F.
+        backward: ``backward(G, H, C, U, N, shown, tape, t)``: G before sample t from G after it, and the slopes of J
+            with respect to ``now``, ``last`` and ``older``. ``shown`` is the adjoint of the first sensor's mean.
+        n_path: numbers in P.
+        n_tape: numbers per sample on the tape.
+    """
+
+    begin: Any
+    coefficients: Any
+    noises: Any
+    input_coefficients: Any
+    step: Any
+    add_information: Any
+    seed_adjoint: Any
+    backward: Any
+    n_path: int
+    n_tape: int
+
+
+@cache
+def compile_adjoint(model: Model, degree: int = 0) -> Adjoint:
+    """Compile the adjoint of a model.
 
     Args:
-        model: whose equation.
-        degree: of the input's polynomial over a sample, 0 or 1.
-
-    Returns:
-        A namespace of
-
-        - ``begin(start)``: P and a zero F, from an array that holds P; ``coefficients(values)``: C, and
-          ``noises(values)``: N, from arrays.
-        - ``lay(now, last, older)``: U from the inputs, newest first.
-        - ``step(P, F, C, U, N, tape, t)``: P and F after sample t; what the first sensor shows, and its variance.
-        - ``add_information(F, precision, total)``: the lower triangle of the matrix Λ + F.
-        - ``seed_adjoint(inverse)``: a zero G, and H where J = ½ log det(Λ + F).
-        - ``backward(G, H, C, U, N, shown, tape, t)``: G before sample t, from that after it and the adjoint of what the
-          first sensor shows; and the slopes of J by ``now``, ``last`` and ``older``.
-        - ``n_path``, ``n_tape``: numbers in P, and of one sample on the tape.
+        model: the equation.
+        degree: degree of the input's polynomial over a sample, 0 or 1.
 
     Raises:
         ValueError: for another degree.
     """
     if degree not in (0, 1):
-        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
+        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline needs the whole record")
     key = repr((model.digest, degree))
-    return load_generated(model.name, "gradient", key, lambda: _source(model, degree), RUNTIME_FUNCTIONS)
+    code = load_generated(model.name, "gradient", key, lambda: _source(model, degree), RUNTIME_FUNCTIONS)
+    return Adjoint(**{field.name: getattr(code, field.name) for field in fields(Adjoint)})
 
 
 def _source(model: Model, degree: int) -> str:
@@ -72,7 +91,9 @@ def _source(model: Model, degree: int) -> str:
     }
     tuple_contents |= {"C": coefficients, "U": inputs, "N": noises}
     after = [path_after, [results.get(row, row) for row in information], [results[shown], results["SPREAD"]]]
-    source = printer_numba.print_scalar_function("finish", lines, after, tuple_contents, doc="Predict and see.")
+    source = printer_numba.print_scalar_function(
+        "finish", lines, after, tuple_contents, doc="Predict, and add the information."
+    )
     outputs_kept = {row: results[row] for row in (*path_rows, *information, shown) if row in results}
     adjoints = {"G": [f"G_{row}" for row in path_rows], "H": [f"G_{row}" for row in information]}
     tuple_contents = {
@@ -88,13 +109,15 @@ def _source(model: Model, degree: int) -> str:
 
 
 def _integrator_source(model: Model, degree: int, integrated: list[str], path_rows: list[str]) -> str:
-    """Source of what carries a differential equation over a sample, and of its reverse."""
+    """Source of the integrator of a differential equation over a sample, and of its reverse."""
     from estimator.engine import printer_numba, symbolic, variational_rk4
 
     tuple_contents = {"M": integrated, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [printer_numba.print_expression(value) for value in symbolic.integrator_start(model).values()]
     step, moves = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_E" for name in integrated}
-    source = printer_numba.print_scalar_function("start", [], [start], {"P": path_rows}, doc="The point that moves.")
+    source = printer_numba.print_scalar_function(
+        "start", [], [start], {"P": path_rows}, doc="The integrator at the start of a sample."
+    )
     source += printer_numba.print_scalar_function(
         "move", step, [list(moves.values())], tuple_contents, ("T",), "A Runge-Kutta step."
     )
@@ -108,7 +131,7 @@ def _integrator_source(model: Model, degree: int, integrated: list[str], path_ro
         ("T",),
         tuple_contents["U"],
     )
-    # The point begins at the path's states, with slopes and noise that are constants.
+    # The integrator begins at the filter's states, with constant slopes and noise.
     states = list(model.states)
     results = [f"G_M_{i}" for i in states] + [f"G_{row}" for row in path_rows[len(states) :]]
     arguments = {"G": [f"G_{row}" for row in path_rows], "GM": adjoints["GM"]}
@@ -124,7 +147,7 @@ def _reverse_source(
     uniform: Sequence[str] = (),
     accumulated: Sequence[str] = (),
 ) -> str:
-    """Source of the reverse of assignments (`with_reverse`), which returns adjoints by tuple, those of ``result_groups``."""
+    """Source of the reverse of assignments (`with_reverse`): it returns a tuple of adjoints for each result group."""
     from estimator.engine import printer_numba
 
     back, found = with_reverse(lines, results, [row for group in result_groups for row in group], accumulated)
@@ -135,20 +158,20 @@ def _reverse_source(
 def with_reverse(
     lines: Any, results: Mapping[str, str], inputs: Sequence[str], accumulated: Sequence[str] = ()
 ) -> tuple[Any, dict[str, str]]:
-    """Assignments, then their reverse: adjoints of what stands before them, from those of the results.
+    """Append the reverse derivative to assignments.
 
     Args:
-        lines: forward.
-        results: row to the name that holds its value. The adjoint of a row is ``G_<row>``.
-        inputs: rows whose adjoints are asked for.
-        accumulated: of these, those whose adjoints have come from elsewhere already.
+        lines: the forward assignments.
+        results: row to the name of its value. The adjoint of a row is ``G_<row>``.
+        inputs: rows whose adjoints are wanted.
+        accumulated: rows among ``inputs`` whose adjoints are added to an earlier value.
 
     Returns:
-        All lines, and the names that hold the adjoints that are asked for.
+        All assignments, and ``G_<row>`` of each input to the name of its value.
     """
     from estimator.engine import printer_numba, symbolic
 
-    # A result that is a number, the row itself or another result's passes its adjoint on by a line of its own.
+    # A result that is a number, a row or the value of another result gets a line of its own, with its own adjoint.
     forward = list(lines)
     assigned = {target for target, _ in forward}
     seeds: dict[str, str] = {}
@@ -161,7 +184,7 @@ def with_reverse(
             seeds[f"{row}_copy"] = f"G_{row}"
     back = symbolic.reverse_mode_derivative(forward, inputs, seeds)
     adjoint_before = {f"G_{row}": f"BG_{row}" for row in inputs}
-    split = len(back) - len(inputs)  # the adjoints that are wanted come last, and have names of their own from here on
+    split = len(back) - len(inputs)  # the wanted adjoints come last, and get new names
     ends = [
         (adjoint_before[target], e + (symbolic.symbol(target) if target.removeprefix("G_") in accumulated else 0))
         for target, e in back[split:]
@@ -172,7 +195,7 @@ def with_reverse(
 def _sample_source(
     model: Model, degree: int, integrated: list[str], path_rows: list[str], information: list[str]
 ) -> str:
-    """Source of the whole sample, forward and back, and of what begins and ends a path."""
+    """Source of the functions of `Adjoint`."""
     n, m, k = len(path_rows), len(integrated), model.n_coefficients
     inputs = len(input_rows(model, degree))
     tuple_of = lambda array, count, first="": f"({''.join(f'{array}[{first}{i}], ' for i in range(count))})"  # noqa: E731
@@ -185,7 +208,7 @@ def _sample_source(
     upper = list(combinations_with_replacement(range(k), 2))
     kept = "".join(f"    tape[t, {i}] = P[{i}]\n" for i in range(n))
     fill = "".join(f"    total[{j}, {i}] = precision[{j}, {i}] + F[{p}]\n" for p, (i, j) in enumerate(upper))
-    # ∂J/∂F is half the inverse, and an entry beside the diagonal stands for two.
+    # ∂J/∂F is half the inverse; an entry off the diagonal counts twice.
     seeds = ", ".join(f"{'0.5 * ' if i == j else ''}inverse[{j}, {i}]" for i, j in upper)
     source = (
         f"n_path, n_tape = {n}, {n + (model.substeps + 1) * m}\n"

@@ -1,7 +1,7 @@
-"""Paths of many systems and their reverse, for the gradient of what they tell together: in lanes, over many samples.
+"""Gradient of the predicted Fisher information with respect to shared inputs, for many systems in SIMD lanes.
 
-The arithmetic is that of `estimator.engine.adjoint`, whose one system is in registers. Here as many systems as there
-are lanes follow the same inputs, each with coefficients, noises and a start of its own.
+The arithmetic is the same as in `estimator.engine.adjoint`. All lanes take the same inputs; each has its own
+coefficients, noises and start.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from estimator.models.model import Model
 class LaneAdjoint:
     """Compiled functions of blocks ``W`` and ``A`` of the same layout; ``A`` holds the adjoints of the rows of ``W``.
 
-    A tape (T, n_tape) keeps what samples begin with.
+    A tape (T, n_tape) stores the start of every sample.
 
     Attributes:
         forward: ``forward(W, tape, t)``: sample t of every lane.
-        backward: ``backward(W, A, tape, t)``: the reverse of sample t, whose input is in ``W``. In ``A`` the path's rows have
-            the adjoints after it, and receive those before it; the information's rows and what the first sensor shows
-            have theirs; the rows of the input receive theirs.
-        layout: rows of a block, as `estimator.engine.kernels.LinearisedFilter` has them.
-        n_tape: numbers of one sample on the tape.
+        backward: ``backward(W, A, tape, t)``: the reverse of sample t, with its input in ``W``. It reads from ``A`` the
+            adjoints of the information and of the first sensor's mean, replaces the filter state's adjoints after the
+            sample by the adjoints before it, and writes the adjoints of the input.
+        layout: row number of each quantity, as in `estimator.engine.kernels.LinearisedFilter`.
+        n_tape: numbers per sample on the tape.
     """
 
     forward: Any
@@ -42,7 +42,7 @@ class LaneAdjoint:
 
 @cache
 def compile_lane_adjoint(model: Model, degree: int = 0) -> LaneAdjoint:
-    """The paths of a model, along the response without noise; ``degree`` as in `estimator.engine.adjoint.compile_adjoint`."""
+    """Compile the adjoint of a model in SIMD lanes; arguments as `estimator.engine.adjoint.compile_adjoint`."""
     place = linearised_filter_layout(model, degree, follows_outputs=False)
     key = repr((model.digest, degree))
     code = load_generated(model.name, "gradient-lanes", key, lambda: _source(model, degree, place), RUNTIME_FUNCTIONS)
@@ -58,7 +58,9 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
     more, results = linearised_filter_step(model, propagation, degree, follows_outputs=False)
     lines = [*lines, *more]
     shown = f"SHOWN_{next(iter(model.outputs))}"
-    source = printer_numba.print_lane_loop("finish", lines, results, layout, LANES, doc="Predict and see.")
+    source = printer_numba.print_lane_loop(
+        "finish", lines, results, layout, LANES, doc="Predict, and add the information."
+    )
     information_rows = [row for row in results if row.startswith("F_")]
     followed = {row: results[row] for row in (*path_rows, *information_rows, shown) if row in results}
     wanted = [*path_rows, *integrated, *inputs]
@@ -70,7 +72,7 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
         step, ends = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_E" for name in integrated}
         back, adjoints = with_reverse(step, ends, [*integrated, *inputs], inputs)
         source += printer_numba.print_lane_loop(
-            "move_back", back, adjoints, layout, LANES, ("T",), "The reverse of a step."
+            "move_back", back, adjoints, layout, LANES, ("T",), "The reverse of a Runge-Kutta step."
         )
         started = {f"G_{i}": f"G_M_{i}" for i in model.states}
         source += printer_numba.print_lane_loop("begin_back", [], started, layout, LANES, doc="The reverse of begin.")
@@ -78,26 +80,34 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
 
 
 def _sample_source(n_filter_state: int, n_integrated: int, first_integrated: int, steps: int) -> str:
-    """Source of a whole sample, forward and back: so many numbers of the path, so many carried ones, and where."""
+    """Source of a whole sample, forward and backward.
+
+    Args:
+        n_filter_state: numbers of the filter's state in a block, from its start on.
+        n_integrated: numbers of the integrator; 0 for a difference equation.
+        first_integrated: place of the first of them.
+        steps: Runge-Kutta steps per sample.
+    """
+    n, m, first = n_filter_state, n_integrated, first_integrated
     source = (
-        f"n_tape = {n_filter_state + (steps + 1) * n_integrated if n_integrated else n_filter_state}\n"
+        f"n_tape = {n + (steps + 1) * m if m else n}\n"
         "@jit\ndef keep(W, first, tape, t, place, count):\n"
         "    for i in range(count):\n        tape[t, place + i] = W[first + i]\n"
         "@jit\ndef restore(W, first, tape, t, place, count):\n"
         "    for i in range(count):\n        W[first + i] = tape[t, place + i]\n"
     )
-    if not n_integrated:
+    if not m:
         return source + (
-            f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    finish(W)\n"
-            f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n_filter_state})\n    finish_back(W, A)\n"
+            f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n})\n    finish(W)\n"
+            f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n})\n    finish_back(W, A)\n"
         )
     return source + (
-        f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n_filter_state})\n    begin(W)\n"
-        f"    for s in range({steps}):\n        keep(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
+        f"@jit\ndef forward(W, tape, t):\n    keep(W, 0, tape, t, 0, {n})\n    begin(W)\n"
+        f"    for s in range({steps}):\n        keep(W, {first}, tape, t, {n} + {m} * s, {m})\n"
         f"        move(W, s / {steps})\n"
-        f"    keep(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish(W)\n"
-        f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n_filter_state})\n"
-        f"    restore(W, {first_integrated}, tape, t, {n_filter_state + n_integrated * steps}, {n_integrated})\n    finish_back(W, A)\n"
-        f"    for s in range({steps - 1}, -1, -1):\n        restore(W, {first_integrated}, tape, t, {n_filter_state} + {n_integrated} * s, {n_integrated})\n"
+        f"    keep(W, {first}, tape, t, {n + m * steps}, {m})\n    finish(W)\n"
+        f"@jit\ndef backward(W, A, tape, t):\n    restore(W, 0, tape, t, 0, {n})\n"
+        f"    restore(W, {first}, tape, t, {n + m * steps}, {m})\n    finish_back(W, A)\n"
+        f"    for s in range({steps - 1}, -1, -1):\n        restore(W, {first}, tape, t, {n} + {m} * s, {m})\n"
         f"        move_back(W, A, s / {steps})\n    begin_back(W, A)\n"
     )

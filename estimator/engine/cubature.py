@@ -1,17 +1,17 @@
-"""Sigma points, as assignments: a belief's motion by the cubature rule of degree 3.
+"""Sigma-point prediction of a Gaussian belief, as assignments: the cubature rule of degree 3.
 
 (Arasaratnam and Haykin 2009, doi:10.1109/TAC.2009.2019800; an unscented transform whose centre has no weight.)
 
-The points lie along the columns of √pairs L, L Lᵀ = P over the *movers*, the quantities on which the motion depends;
-the other rows of L say how the rest goes along. A mover of variance 0, or one that depends on those before it, leaves a
-column of zeros without weight: all lanes run through all columns, each with the weights that it has. Rows:
+The factor L of the covariance, L Lᵀ = P, begins with the *movers*, the quantities on which the dynamics depend. The
+points lie along its columns times √n, n the number of active columns. A mover that has variance 0, or depends linearly
+on movers before it, leaves a column of zeros without weight. All lanes run through all columns. Rows:
 
 ============  ======================================================================================
-``L_c_i``     column c of √pairs L at quantity i
-``WEIGHT_c``  of each of the two points along column c
-``X_i``       coefficient i at the point that moves; its state is in ``M_i``
-``I_p_i``     state i after the motion, at point p: 2 c in the direction of column c, 2 c + 1 against it
-``UNSOUND``   how often a covariance was not positive semi-definite, since it was last set to 0
+``L_c_i``     entry i of column c of √n L
+``WEIGHT_c``  weight of each of the two points along column c
+``X_i``       coefficient i at the current point; its state is in ``M_i``
+``I_p_i``     state i after the sample at point p: 2 c along column c, 2 c + 1 against it
+``UNSOUND``   count of covariances that were not positive semi-definite, since the row was last set to 0
 ============  ======================================================================================
 """
 
@@ -36,15 +36,15 @@ from estimator.engine.symbolic import (
 )
 from estimator.models.model import Model
 
-#: What rounding leaves of the variance of a dimension that depends on those before it, as a part of that variance.
+#: Pivot of the factorisation, as a fraction of the variance, up to which a column counts as linearly dependent [1].
 PIVOT_TOLERANCE = 1e-14
 
 
 def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
-    """The columns of √pairs L and their weights, and whether P is a covariance: assignments and results by row.
+    """The columns of √n L, their weights, and a test of P: assignments and results by row.
 
-    A column is dead where its pivot is within `PIVOT_TOLERANCE` of the variance. P is not a covariance where a pivot is
-    below that, or a dead column still goes along with another quantity.
+    A column is inactive where its pivot is at most `PIVOT_TOLERANCE` of the variance. P is no covariance where a pivot
+    is below minus that, or where an inactive column is correlated with another quantity.
     """
     names, m = cubature_order(model), len(model.dynamic_names)
     covariance = lambda i, j: symmetric_entry("P", i, j, model.names)  # noqa: E731
@@ -75,7 +75,7 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
     point_weight = assign("EACH", HALF / select(n_active, n_active, ONE))
     results = {}
     for c in range(m):
-        # Where everything is known, two points at the mean move with it.
+        # With no active column, two points stay at the mean.
         weight = point_weight * active[c] if c else point_weight * select(n_active, active[0], ONE)
         results[f"WEIGHT_{c}"] = str(assign(f"WEIGHT_{c}_e", weight))
         for i in names[:c]:
@@ -87,7 +87,7 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
 
 
 def point_names(model: Model) -> dict[str, str]:
-    """Names of the movers at a point."""
+    """Mover to its name at the current point."""
     return {i: f"M_{i}" if i in model.states else f"X_{i}" for i in model.dynamic_names}
 
 
@@ -104,7 +104,7 @@ def propagate_point(model: Model, degree: int) -> Assignments:
 
 
 def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str]]:
-    """A whole sample of a difference equation, from the point at ``SIGN`` times ``L_C`` to its image ``I_P``."""
+    """A whole sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``I_P``."""
     lines, _ = place_point(model)
     named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
@@ -113,7 +113,7 @@ def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str
 
 
 def point_moments(model: Model) -> tuple[Assignments, Propagation]:
-    """Mean and covariance Q of the images, without process noise, whose covariance is that at the mean."""
+    """Mean and covariance Q of the points after the sample; the process noise covariance is evaluated at the mean."""
     states, m = list(model.states), len(model.dynamic_names)
     lines: Assignments = []
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]

@@ -1,8 +1,8 @@
-"""What a model's belief expects of inputs, compiled: one expected sample in every lane, and what has been learned.
+"""Predicted belief under planned inputs, for experiment design: one sample without data in every SIMD lane.
 
-The structured update (`estimator.engine.kernels`) with E[γ] and E[ξ] fixed and every output as it is expected: the means
-follow the trajectory without noise, and the joint covariance of states and coefficients contracts as it would. So what
-one sample teaches is not counted again by the next. The coefficients' means stay, and are the same in all lanes.
+The update is the structured one (`estimator.engine.kernels`) with E[γ] and E[ξ] fixed and every output equal to its
+prediction: the means follow the noise-free trajectory, and the joint covariance of states and coefficients contracts as
+with data. The coefficients' means stay, and are the same in all lanes.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import upper_triangle_names
 from estimator.models.model import Model
 
-#: What a belief that is no longer finite knows: less than any other, and still a number to compare with.
+#: Information [nats] of a belief that has diverged: finite, and below all others.
 DIVERGED_SCORE = -1e300
 
 
 @dataclass(frozen=True)
 class ExpectedUpdate:
-    """The imagination of a model.
+    """The predicted belief of a model, in SIMD lanes.
 
-    The newest input of a sample stands in row ``INPUT``; older ones, where the model looks at them, in ``LAST_INPUT``
-    and ``OLDER_INPUT``, and move on by themselves.
+    The newest input of a sample is in row ``INPUT``. Older inputs, if the model has them, are in ``LAST_INPUT`` and
+    ``OLDER_INPUT``; ``advance`` shifts them.
 
     Attributes:
-        advance: ``advance(W, record, walk)``: one expected sample in every lane. Means of the coefficients and of the
-            noises' precisions are those of a belief's record; ``walk`` (K,) are variances by which the coefficients
-            walk before the sample. Leaves in ``SHOWN`` what the first sensor is expected to show, in ``SPREAD`` the
-            variance of that output, and in ``SURPRISE`` that by which the output before it, if that was imagined too,
-            moves what is expected.
-        final_information: ``final_information(W, M, s)``: leaves ½ log det(C⁻¹ + s² M Mᵀ) in ``KNOWN``, with C the coefficients' covariance and
-            M (K, K), lower triangular, the factor of the information that is still to come; `DIVERGED_SCORE` where C is no
-            covariance any more.
-        layout: rows of the block. The first are all that stands for a plan between two samples: the states, their joint
-            covariance with the coefficients (``P_i_j``), the inputs, ``COST``, and ``BEGUN``, which is 0 before the
-            first sample. Then, of a differential equation, the states in the middle of the last sample and at its end
-            (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
-        kept: number of these first rows.
+        advance: ``advance(W, record, walk)``: one sample without data in every lane. ``record`` is the flat record of a
+            belief, for the means of the coefficients and precisions; ``walk`` (K,) are the variances of the
+            coefficients' random walk before the sample. It writes the predicted output of the first sensor into
+            ``SHOWN``, its variance into ``SPREAD``, and into ``SURPRISE`` the variance by which the output before, if
+            it was predicted too, will shift the prediction.
+        final_information: ``final_information(W, M, s)``: writes ½ log det(C⁻¹ + s² M Mᵀ) [nats] into ``KNOWN``, with C
+            the coefficients' covariance and M (K, K), lower triangular, the factor of the information beyond the plan;
+            `DIVERGED_SCORE` where C is no covariance.
+        layout: row number of each quantity. The first rows are the memory of a plan between two samples: the states,
+            the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``BEGUN``, which is 0
+            before the first sample. A differential equation adds its states in the middle and at the end of the last
+            sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
+        kept: number of rows of that memory.
     """
 
     advance: Any
@@ -54,18 +54,20 @@ class ExpectedUpdate:
 
 @cache
 def compile_expected_update(model: Model, degree: int = 0, lag: int = 0) -> ExpectedUpdate:
-    """The imagination of a model.
+    """Compile the predicted belief of a model.
 
     Args:
-        model: whose belief.
-        degree: of the input over a sample of a differential equation: 0 held, 1 linear from the last input to this one.
-        lag: 1 where a difference equation takes every input a sample later.
+        model: the equation.
+        degree: degree of the input over a sample of a differential equation: 0 held, 1 linear from the last input.
+        lag: delay of the inputs of a difference equation, 0 or 1 sample.
 
     Raises:
         ValueError: for another degree or lag.
     """
     if degree not in (0, 1) or lag not in (0, 1) or (model.is_continuous and lag):
-        raise ValueError(f"degree and lag must be 0 or 1, and lag 0 for a differential equation: {degree}, {lag}")
+        raise ValueError(
+            f"degree and lag must be 0 or 1, and lag 0 for a differential equation, but are {degree} and {lag}"
+        )
     inputs = input_history_rows(model, degree, lag)
     state_rows = [*model.states, *upper_triangle_names("P", model.names), *inputs, "COST", "BEGUN"]
     trajectory_rows = [f"{at}_{i}" for at in ("MIDDLE", "END") for i in model.states] if model.is_continuous else []
@@ -80,13 +82,13 @@ def compile_expected_update(model: Model, degree: int = 0, lag: int = 0) -> Expe
 
 
 def input_history_rows(model: Model, degree: int, lag: int) -> list[str]:
-    """Rows of the inputs that a sample depends on, newest first."""
+    """Rows of the inputs of a sample, newest first."""
     older = degree if model.is_continuous else min(2, model.taps - 1 + lag)
     return ["INPUT", "LAST_INPUT", "OLDER_INPUT"][: older + 1]
 
 
 def input_polynomial(model: Model, degree: int, lag: int) -> dict[str, Any]:
-    """The input over a sample, ``U_k``, in symbols of those rows."""
+    """``U_k`` of the input over a sample, in symbols of `input_history_rows`."""
     from estimator.engine.symbolic import symbol
 
     inputs = [symbol(name) for name in input_history_rows(model, degree, lag)]
@@ -106,7 +108,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapp
         else symbolic.propagate_difference_equation(model)
     )
     more, results = gaussian_update.update_without_data(model, propagation, degree)
-    # The coefficients walk before the sample, so that what it does begins with the wider covariance.
+    # The random walk of the coefficients comes before the sample, which begins with the wider covariance.
     walked = {f"P_{c}_{c}": f"WALKED_{c}" for c in coefficients}
     wider = [(walked[f"P_{c}_{c}"], symbol(f"P_{c}_{c}") + symbol(f"WALK_{c}")) for c in coefficients]
     lines = wider + symbolic.substitute([*lines, *more], {**walked, **input_values})
@@ -114,22 +116,25 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapp
     results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
     noises = ["Q", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
-    source = printer_numba.print_lane_loop("expect", lines, results, layout, LANES, uniform, doc="One expected sample.")
+    source = printer_numba.print_lane_loop(
+        "expect", lines, results, layout, LANES, uniform, doc="One sample without data."
+    )
     if model.is_continuous:
-        # In a loop of its own: each step waits for the one before, and meanwhile processors take those of other lanes.
+        # In a loop of its own: each step waits for the one before, and the processor takes other lanes meanwhile.
         path, points = variational_rk4.coarse_trajectory(model, degree)
         path = symbolic.substitute(path, input_values)
         source += printer_numba.print_lane_loop(
-            "travel", path, points, layout, LANES, coefficients, "Where the sample leads to."
+            "travel", path, points, layout, LANES, coefficients, "The noise-free trajectory over the sample."
         )
-    # What the loops want of a record.
+    # Entries of a belief's record: means, then covariance, then shape and rate of each precision.
     n, k = model.n_states, model.n_coefficients
     first = (n + k) + (n + k) * (n + k + 1) // 2
     means = ", ".join(f"record[{n + c}]" for c in range(k))
     uniform_values = [f"record[{first + 2 * i + 1}] / record[{first + 2 * i}]" for i in range(1 + model.n_outputs)]
     uniform_values += [f"walk[{c}]" for c in range(k)]
     travel_call = f"    travel(W, {means})\n" if model.is_continuous else ""
-    source += f"@scalar_jit\ndef advance(W, record, walk):\n{travel_call}    expect(W, {means}, {', '.join(uniform_values)})\n"
+    expect_call = f"    expect(W, {means}, {', '.join(uniform_values)})\n"
+    source += f"@scalar_jit\ndef advance(W, record, walk):\n{travel_call}{expect_call}"
     return source + _information_source(model, layout)
 
 
@@ -145,7 +150,7 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     cov = [[symbolic.symmetric_entry("P", i, j, names) for j in names] for i in names]
     factor = [[symbol(f"M_{i}_{j}") if j <= i else sp.S.Zero for j in range(k)] for i in range(k)]
     lines: symbolic.Assignments = []
-    product = {}  # C M, below the diagonal and on it: the rest is not needed for the upper triangle of Mᵀ (C M)
+    product = {}  # the lower triangle of C M, which is enough for Mᵀ (C M)
     for j in range(k):
         for i in range(j, k):
             lines.append((f"C_{i}_{j}", sum(cov[i][m] * factor[m][j] for m in range(j, k))))
@@ -158,7 +163,7 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
             future_entries[i, j] = symbol(f"A_{i}_{j}")
     with_future = ldl_factorise(future_entries, k, "J", allow_zero_pivots=True)
     now = ldl_factorise({(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "N", allow_zero_pivots=True)
-    # Divisions take longest, so the two share them.
+    # Divisions take longest, so the two factorisations share them.
     both = dict(zip(map(str, with_future.inverse), zip(with_future.pivots, now.pivots, strict=True), strict=True))
     for (name, value), (name_now, value_now) in zip(with_future.lines, now.lines, strict=True):
         if name in both:
@@ -168,7 +173,7 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
         lines += [(name, value), (name_now, value_now)]
     lines += [("NOW", now.determinant), ("RATIO", with_future.determinant / symbol("NOW"))]
     ratio = symbol("RATIO")
-    # `log` is that of positive, normal numbers; comparisons with NaN do not hold.
+    # `log` is for positive, normal numbers; comparisons with NaN are false.
     known = symbolic.select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
     known = symbolic.select(
         symbol("NOW"), symbolic.select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)), sp.Float(DIVERGED_SCORE)
@@ -176,7 +181,13 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
     source = printer_numba.print_lane_loop(
-        "final_information_lanes", lines, {"KNOWN": "NATS"}, layout, LANES, uniform, doc="What will be known."
+        "final_information_lanes",
+        lines,
+        {"KNOWN": "NATS"},
+        layout,
+        LANES,
+        uniform,
+        doc="Information about the coefficients.",
     )
     factor_entries = ", ".join(f"scale * M[{i}, {j}]" for i in range(k) for j in range(i + 1))
     return source + f"@jit\ndef final_information(W, M, scale):\n    final_information_lanes(W, {factor_entries})\n"

@@ -1,20 +1,20 @@
-"""The packed algebra of a filter, as assignments: what a sample does to a joint Gaussian, or to a path.
+"""Kalman update of the joint belief in states and coefficients with unknown noise variances, as assignments.
 
-With M, S, N of a sample (`estimator.engine.symbolic`) the joint covariance P of states and coefficients is predicted by
-Q = S P Sᵀ, and sensors are taken one after another: with h the derivative of what a sensor shows,
+With M, S, N of a sample (`estimator.engine.symbolic`) the predicted covariance of states and coefficients is
+Q = S P Sᵀ. The sensors are taken one after another. With h the gradient of a sensor's output,
 
     c = Q h,   s = hᵀ Q h,   e = y - prediction,   q = hᵀ N h / E[γ],   r = 1/E[ξ],
 
-for fixed E[γ], E[ξ] a Kalman step; minimising the free energy over q(γ) and q(ξ) needs the moments of both noises under
-that step's posterior, which depend on scalars only:
+the step for fixed E[γ] and E[ξ] is a Kalman step. The free energy is minimised over q(γ) and q(ξ) by the second moments
+of both noises under the posterior of that step, which are scalar functions:
 
     E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
 
-γ is learned from the first sensor that shows the process noise of the same sample; where none does, γ stays.
+γ is updated by the first sensor whose output depends on the process noise of the same sample; without one, γ stays.
 
-Where a sample says 10⁸ times more than was known, rounding may leave a matrix that is not positive semi-definite.
-So every variance takes along what rounding may have changed it by, `ROUNDING` of what it is the difference of: the
-rounded matrix is the exact one and an error E, |E_ij| ≤ a_i a_j ROUNDING/d, to which ROUNDING diag(a²) is added.
+Rounding may leave an indefinite matrix after a sample with 10⁸ times the prior information. So every variance is
+increased by its rounding error, `ROUNDING` times its terms: the rounded matrix is the exact one plus an error E,
+|E_ij| ≤ a_i a_j ROUNDING/d, to which ROUNDING diag(a²) is added.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from estimator.engine.symbolic import (
 )
 from estimator.models.model import Model
 
-#: What rounding may change a variance by, in parts of its terms: 64 times 2⁻⁵³, for sums of d² = 36 or so products.
+#: Bound of a variance's rounding error, as a fraction of its terms [1]: 64 units of 2⁻⁵³, for sums of 36 products.
 ROUNDING = 2.0**-47
 
 
 class GaussianUpdate:
-    """The predicted joint Gaussian, while sensors are taken: symbols or expressions of its mean and covariance.
+    """The joint Gaussian of a sample, from the prediction on: symbols or expressions of its mean and covariance.
 
     Args:
-        model: whose quantities.
-        propagation: the motion over the sample.
+        model: the equation.
+        propagation: the dynamics over the sample.
     """
 
     def __init__(self, model: Model, propagation: Propagation) -> None:
@@ -67,7 +67,7 @@ class GaussianUpdate:
             **{c: symbol(c) for c in model.coefficients},
         }
         self.cov: dict[tuple[str, str], sp.Expr] = {}
-        self.transition_cov: dict[str, dict[str, sp.Expr]] = {}  # rows of S P
+        self.transition_cov: dict[str, dict[str, sp.Expr]] = {}  # rows of S P, by state
         self._predict()
 
     def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
@@ -75,15 +75,15 @@ class GaussianUpdate:
         return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
 
     def _project_to_psd(self, noise_cov: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
-        """N where it is positive semi-definite; else its variances, with covariances cut to what they allow.
+        """N if it is positive semi-definite; else its variances, with the covariances clipped to the range they allow.
 
-        N is integrated by steps that are too long for slopes of more than about 3 a step, and may then be anything.
+        The integrated N is wrong where the Jacobian of the rates exceeds about 3 per step, and may then be indefinite.
         """
         n = len(noise_cov)
         entries = {(a, b): noise_cov[a][b] for a in range(n) for b in range(a, n)}
         for a in range(n):
             entries[a, a] = self.assign(f"SOUND_{a}_{a}", positive_part(entries[a, a]))
-        remaining = dict(entries)  # what those before leave of it
+        remaining = dict(entries)  # the Schur complement
         for a in range(n - 1):
             for b in range(a + 1, n):
                 largest = self.assign(
@@ -106,7 +106,7 @@ class GaussianUpdate:
         return tuple(tuple(entries[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
 
     def _predict(self) -> None:
-        """Q = S P Sᵀ, or Q as it is where no S is given: the states' rows change, the coefficients' block stays."""
+        """Q = S P Sᵀ in the states' rows, or the given ``Q_i_j`` where there is no S; the coefficients' block stays."""
         names, jacobian, rows = self.names, self.propagation.jacobian, self.transition_cov
         for a, i in enumerate(names):
             for j in names[a:]:
@@ -131,7 +131,7 @@ class GaussianUpdate:
                 self.cov[i, j] = rows[i][j]
 
     def predicted_output(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
-        """What a sensor is expected to show, and its derivative h by all quantities, at the mean now."""
+        """Predicted output of a sensor at the current mean, and its gradient h by all quantities."""
         c = differentiate(self.model)
         at = {symbol(name): value for name, value in self.mean.items()} | {
             symbol("u"): input_at_end(self.model, degree)
@@ -139,10 +139,10 @@ class GaussianUpdate:
         return c.outputs[sensor].xreplace(at), [slope.xreplace(at) for slope in c.output_slopes[sensor]]
 
     def pending_output_variance(self, output_slope: Sequence[sp.Expr], sensor_variance: sp.Expr) -> sp.Expr:
-        """Variance by which the output of the sample before, not seen yet, moves what a sensor is expected to show.
+        """Variance by which the output of the sample before, not measured yet, will shift a sensor's prediction.
 
-        With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): its gain is P h / r, and its own variance
-        r² / (r - hᵀ P h). That is kept above 0, since the P of a belief may be more than an output leaves.
+        With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): the gain is P h / r, and the innovation's variance
+        r² / (r - hᵀ P h). The divisor is kept above 0, since the P of a prior may exceed the P after an output.
         """
         h = {i: slope for i, slope in zip(self.names, output_slope, strict=True) if slope != 0}
         before = {(i, j): symmetric_entry("P", i, j, self.names) for i in h for j in h}
@@ -162,7 +162,7 @@ class GaussianUpdate:
         )
 
     def output_process_noise(self, output_slope: Sequence[sp.Expr]) -> sp.Expr:
-        """hᵀ N h: the variance that unit process noise has in a sensor."""
+        """hᵀ N h: variance of a sensor's output by process noise of unit strength."""
         n = len(self.states)
         total = sum(
             (output_slope[a] * output_slope[b] * self.propagation.noise_cov[a][b] for a in range(n) for b in range(n)),
@@ -171,7 +171,7 @@ class GaussianUpdate:
         return sp.expand(total) if not total.free_symbols else total
 
     def innovation_covariance(self, output_slope: Sequence[sp.Expr], tag: str) -> tuple[dict[str, sp.Expr], sp.Expr]:
-        """C = Q h and s = hᵀ c."""
+        """Covariances c = Q h with a sensor's output, and its variance s = hᵀ c."""
         cross_cov = {}
         for i in self.names:
             total = sum((h * self[i, j] for j, h in zip(self.names, output_slope, strict=True)), ZERO)
@@ -180,7 +180,7 @@ class GaussianUpdate:
         return cross_cov, self.assign(f"S{tag}", s)
 
     def add_process_noise(self, process_variance: sp.Expr) -> None:
-        """Q + N strength, of the states."""
+        """Add the process noise: Q + N ``process_variance`` in the states' block."""
         for a, i in enumerate(self.states):
             for b in range(a, len(self.states)):
                 k, unit_noise = self.states[b], self.propagation.noise_cov[a][b]
@@ -188,12 +188,26 @@ class GaussianUpdate:
                     self.cov[i, k] = self.assign(f"R_{i}_{k}", self.cov[i, k] + process_variance * unit_noise)
 
     def condition(
-        self, output_slope: Sequence[sp.Expr], cross_cov: dict[str, sp.Expr], inverse_innovation_cov: sp.Expr, scaled_innovation: sp.Expr, retained_fraction: sp.Expr,
-        tag: str, is_observed: sp.Expr = ONE,
-    ) -> None:  # fmt: skip
-        """Condition on a sensor: mean + c step, Q - c cᵀ weight; ``retained_fraction`` is r weight; ``is_observed`` is 0 for no output.
+        self,
+        output_slope: Sequence[sp.Expr],
+        cross_cov: dict[str, sp.Expr],
+        inverse_innovation_cov: sp.Expr,
+        scaled_innovation: sp.Expr,
+        retained_fraction: sp.Expr,
+        tag: str,
+        is_observed: sp.Expr = ONE,
+    ) -> None:
+        """Condition on a sensor: mean + c e/S and Q - c cᵀ/S.
 
-        A quantity that the sensor shows as it is keeps its row times r/S, which cannot become negative by rounding.
+        Args:
+            output_slope: h.
+            cross_cov: c, by quantity.
+            inverse_innovation_cov: 1/S.
+            scaled_innovation: e/S.
+            retained_fraction: r/S. A quantity that the sensor measures directly keeps this fraction of its row, which
+                rounding cannot make negative.
+            tag: the sensor's number, in the names of the assignments.
+            is_observed: 0 for a missing output, else 1.
         """
         measured = [i for i, h in zip(self.names, output_slope, strict=True) if h == 1]
         measured_quantity = measured[0] if sum(h != 0 for h in output_slope) == 1 and measured else None
@@ -215,7 +229,7 @@ class GaussianUpdate:
                 self.cov[i, j] = self.assign(f"P{tag}_{i}_{j}", value * factor - gain[i] * cross_cov[j])
 
     def row_results(self) -> dict[str, str]:
-        """Row of the belief to the name that holds its new value, where it has one."""
+        """Row of the belief to the name of its new value, for rows that change."""
         row_values = {name: print_expression(value) for name, value in self.mean.items()}
         for i, j in self.cov:
             row_values[f"P_{i}_{j}"] = print_expression(self.cov[i, j])
@@ -225,22 +239,22 @@ class GaussianUpdate:
 def belief_update(
     model: Model, propagation: Propagation, degree: int, iterations: int, keep_trace: bool, may_be_missing: bool
 ) -> tuple[Assignments, dict[str, str]]:
-    """Condition on all sensors' outputs ``Y_<sensor>``, and learn the noises: assignments and results by row.
+    """Update the belief by the outputs ``Y_<sensor>``, with the noises: assignments and results by row.
 
     Args:
-        model: whose belief.
-        propagation: the motion over the sample.
-        degree: of the input's polynomial, or taps less one.
+        model: the equation.
+        propagation: the dynamics over the sample.
+        degree: degree of the input's polynomial, or the number of taps less one.
         iterations: variational iterations.
-        keep_trace: also leave what the free energy of every iteration needs, in rows ``TRACE_<sensor's number>_<what>``.
-        may_be_missing: an output that is NaN moves nothing but the state.
+        keep_trace: write the terms of every iteration's free energy into rows ``TRACE_<number of the sensor>_<term>``.
+        may_be_missing: an output that is NaN is missing: the state is predicted, and nothing is updated.
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}
     informative_sensor = [
         k for k in range(model.n_outputs) if g.output_process_noise(g.predicted_output(k, degree)[1]) != 0
     ][:1]
-    if not informative_sensor:  # no sensor tells of γ: the noise moves the states as it is believed to
+    if not informative_sensor:  # no sensor informs γ: its prior mean acts
         g.add_process_noise(g.assign("Q_unseen", symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")))
     for k, sensor in enumerate(model.outputs):
         tag, y = str(k), symbol(f"Y_{sensor}")
@@ -286,10 +300,11 @@ def belief_update(
 
 
 def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:
-    """One imagined sample: `belief_update` with outputs as expected and noise variances ``Q`` and ``R_<sensor>`` given.
+    """`belief_update` with every output equal to its prediction, and given noise variances ``Q`` and ``R_<sensor>``.
 
-    Leaves what the first sensor is expected to show in ``SHOWN``, its predictive variance in ``SPREAD``, and in
-    ``SURPRISE`` that of `GaussianUpdate.pending_output_variance`, which is 0 for the first sample: the row ``BEGUN`` is 1 after it.
+    It writes the predicted output of the first sensor into ``SHOWN``, its variance into ``SPREAD``, and
+    `GaussianUpdate.pending_output_variance` into ``SURPRISE``; ``BEGUN`` is 0 before the first sample, for which the
+    latter is 0.
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""The input of a sample as a model takes it."""
+"""The input over a sample: held, linear, or the taps of a difference equation, written into a block."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from estimator.support.argument_checks import check_choice
 
 
 def input_degree(model: Model, interpolation: str) -> int:
-    """The degree of the input's polynomial over a sample.
+    """Degree of the input's polynomial over a sample.
 
     Raises:
         ValueError: for an unknown interpolation, or one that is not ``zero_order`` for a difference equation.
@@ -27,24 +27,24 @@ def input_degree(model: Model, interpolation: str) -> int:
 
 
 def n_older_inputs(model: Model, degree: int) -> int:
-    """Inputs before the newest one that a sample depends on."""
+    """Number of inputs before the newest one in a sample's equation."""
     return degree if model.is_continuous else model.taps - 1
 
 
 def compile_input_writer(model: Model, degree: int, input_rows: Sequence[int], lanes: int) -> Any:
-    """Compiled: ``feed(W, j, now, last, older)`` lays the inputs of a sample, newest first, into lane j of a block.
+    """Compile ``feed(W, j, now, last, older)``, which writes a sample's inputs, newest first, into lane j of a block.
 
     Args:
-        model: that takes them.
-        degree: of the input's polynomial over a sample, 0 or 1.
-        input_rows: rows of ``U_0``, ``U_1``, ...
-        lanes: systems in the block.
+        model: the equation.
+        degree: degree of the input's polynomial over a sample, 0 or 1.
+        input_rows: row numbers of ``U_0``, ``U_1``, ...
+        lanes: lanes of the block.
 
     Raises:
         ValueError: for another degree.
     """
     if degree > 1:
-        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline's input is not known sample by sample")
+        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline needs the whole record")
     rows = [place * lanes for place in input_rows]
     first, second, third = [*rows, 0, 0][:3]
     count, is_line = len(rows), model.is_continuous and degree == 1

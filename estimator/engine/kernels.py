@@ -1,7 +1,6 @@
-"""Two of the tasks that the engine compiles for a model: the update of a belief, and the path of the states.
+"""Compiled filters of a model: the belief update, and the linearised Kalman filter at known coefficients.
 
-Each gives compiled functions over a block ``W`` (`estimator.compilation.simd`), and the layout of its rows. What stands in a block
-of ``lanes`` systems is what `layout` lists; whoever needs more rows adds them behind.
+Each comes with the layout of its block ``W`` (`estimator.compilation.simd`), to which callers may append rows.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ def sqrt(value):
     return np.sqrt(value)
 
 
-#: What generated code may use.
+#: Functions that generated code may call.
 RUNTIME_FUNCTIONS = {"sqrt": sqrt} | {
     name: getattr(elementary_functions, name) for name in GENERATED_FUNCTIONS if name != "sqrt"
 }
@@ -47,10 +46,10 @@ class BeliefUpdate:
     """The belief update of a model.
 
     Attributes:
-        update: ``update(W)``: every lane's belief, with its rows ``U_k`` and ``Y_<sensor>``.
-        layout: rows of the block.
-        count_unsound: with sigma points, ``count_unsound(W)``: counts in the row ``UNSOUND`` whether a lane's covariance is not
-            positive semi-definite. The update does so with the belief that it is given.
+        update: ``update(W)``: updates the belief of every lane by its rows ``U_k`` and ``Y_<sensor>``.
+        layout: row number of each quantity.
+        count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``UNSOUND`` of lanes whose covariance
+            is not positive semi-definite; ``update`` does so at its start.
     """
 
     update: Any
@@ -69,18 +68,18 @@ def compile_belief_update(
     may_be_missing: bool = False,
     expectations: str = "first_order",
 ) -> BeliefUpdate:
-    """The structured update: q(states, coefficients) Gaussian, q(γ) and q(ξ) Gamma.
+    """Compile the structured update: q(states, coefficients) Gaussian, q(γ) and q(ξ) Gamma.
 
     Args:
-        model: whose belief.
-        degree: of the input's polynomial over a sample, for a differential equation: 0 held, 1 linear, 5 a spline.
+        model: the equation.
+        degree: degree of the input's polynomial over a sample of a differential equation: 0 held, 1 linear, 5 a spline.
         iterations: variational iterations per sample, 1 to 100.
-        lanes: systems in a block.
-        block_layout: a layout that holds all rows of `layout`; its own where it is None.
-        keep_trace: leave what the free energy of every iteration needs, in further rows.
-        may_be_missing: outputs that are NaN move the state and teach nothing.
-        expectations: how the belief is moved: ``first_order`` or ``sigma_points`` (`estimator.engine.cubature`). The
-            latter counts in the row ``UNSOUND`` where it meets a covariance that is not positive semi-definite.
+        lanes: lanes of a block.
+        block_layout: a layout with the rows of `update_layout` and perhaps more; None for `update_layout`.
+        keep_trace: write the terms of every iteration's free energy into further rows.
+        may_be_missing: outputs that are NaN are missing: the state is predicted, and nothing is updated.
+        expectations: how the belief is propagated: ``first_order`` or ``sigma_points`` (`estimator.engine.cubature`).
+            The latter counts indefinite covariances in the row ``UNSOUND``.
 
     Raises:
         ValueError: for iterations out of range, or other expectations.
@@ -118,7 +117,7 @@ def _compile_belief_update(
         more, results = gaussian_update.belief_update(
             model, propagation, degree, iterations, keep_trace, may_be_missing
         )
-        # Every layer of functions is compiled: what a difference equation finishes is all of its update.
+        # Every layer of functions takes time to compile, so the update of a difference equation is one function.
         whole = not (uses_cubature or model.is_continuous)
         name = "update" if whole else "finish"
         finish = printer_numba.print_lane_loop(name, lines + more, results, layout, lanes, doc="Predict and condition.")
@@ -137,7 +136,7 @@ def _compile_belief_update(
 
 
 def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes: int) -> str:
-    """Source of ``cubature_columns(W)``, and of ``update(W)`` that takes all points through the sample."""
+    """Source of ``cubature_columns(W)``, and of ``update(W)`` with all sigma points."""
     from estimator.engine import cubature, printer_numba, symbolic, variational_rk4
 
     names = cubature_order(model)
@@ -180,7 +179,7 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
 
 
 def _loop_over_points(model: Model, before: str, body: str) -> str:
-    """Source of ``update(W)`` over all sigma points."""
+    """Source of ``update(W)`` with a loop over all sigma points."""
     head = (
         f"@scalar_jit\ndef update(W):\n    cubature_columns(W)\n{before}    for P in range({2 * len(model.dynamic_names)}):\n"
     )
@@ -189,13 +188,13 @@ def _loop_over_points(model: Model, before: str, body: str) -> str:
 
 @dataclass(frozen=True)
 class LinearisedFilter:
-    """A path at known coefficients: likelihood and Fisher information; `estimator.engine.adjoint` has the gradient.
+    """The linearised Kalman filter at known coefficients, with likelihood and Fisher information.
 
     Attributes:
         sample: ``sample(W)``: one sample of every lane.
-        layout: rows of the block: the coefficients, the input, outputs, ``LIVE``, the variances ``Q`` and
-            ``R_<sensor>`` of the noises, the path and what it adds up.
-        lanes: systems in it.
+        layout: row number of each quantity: the coefficients, the input, outputs, ``LIVE``, the noise variances ``Q``
+            and ``R_<sensor>``, the filter's state and its totals.
+        lanes: lanes of the block.
     """
 
     sample: Any
@@ -207,14 +206,14 @@ class LinearisedFilter:
 def compile_linearised_filter(
     model: Model, degree: int = 0, *, follows_outputs: bool, lanes: int = LANES, variable_step: bool = False
 ) -> LinearisedFilter:
-    """The path of a model (`estimator.engine.linearised_filter.linearised_filter_step`).
+    """Compile the linearised filter of a model (`estimator.engine.linearised_filter.linearised_filter_step`).
 
     Args:
-        model: whose equation.
-        degree: of the input's polynomial over a sample.
-        follows_outputs: whether the filter follows outputs.
-        lanes: systems in a block.
-        variable_step: whether each sample of a differential equation has a length of its own, in the row ``SPAN``.
+        model: the equation.
+        degree: degree of the input's polynomial over a sample.
+        follows_outputs: whether the filter is updated by outputs, or follows the noise-free response.
+        lanes: lanes of a block.
+        variable_step: whether each sample of a differential equation has its own length, in the row ``SPAN``.
     """
     layout = linearised_filter_layout(model, degree, follows_outputs, variable_step)
 
@@ -226,7 +225,9 @@ def compile_linearised_filter(
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
         span = symbolic.symbol("SPAN") if variable_step else symbolic.ONE
         source = variational_rk4.print_integrator(model, degree, layout, lanes, sample_length=span)
-        source += printer_numba.print_lane_loop("finish", lines + more, results, layout, lanes, doc="Predict and see.")
+        source += printer_numba.print_lane_loop(
+            "finish", lines + more, results, layout, lanes, doc="Predict, and add likelihood and information."
+        )
         return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
 
     key = repr((model.digest, degree, follows_outputs, lanes, variable_step))

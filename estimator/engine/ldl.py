@@ -1,4 +1,4 @@
-"""The factorisation L D Lᵀ of a symmetric matrix, as assignments."""
+"""LDLᵀ factorisation of a symmetric matrix, as assignments."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from estimator.engine.symbolic import Assignments, select, symbol
 
 
 class LdlFactors(NamedTuple):
-    """A factorisation.
+    """An LDLᵀ factorisation.
 
     Attributes:
         lines: the assignments.
         lower: (i, j) with j < i to the symbol of L's entry.
-        pivots: the symbols of D.
-        inverse: the symbols of 1/D.
+        pivots: symbols of D.
+        inverse: symbols of 1/D.
     """
 
     lines: Assignments
@@ -27,7 +27,7 @@ class LdlFactors(NamedTuple):
 
     @property
     def determinant(self) -> Any:
-        """Of the matrix."""
+        """Determinant of the matrix."""
         return sp.Mul(*self.pivots)
 
 
@@ -38,9 +38,9 @@ def ldl_factorise(
 
     Args:
         entries: (i, j) with j <= i to the entry.
-        size: of the matrix.
-        name_prefix: of the names that are assigned.
-        allow_zero_pivots: whether a pivot may be 0, of what is known; it counts as 1.
+        size: number of rows.
+        name_prefix: prefix of the assigned names.
+        allow_zero_pivots: whether a pivot of 0 counts as 1, for quantities of variance 0.
     """
     lines: Assignments = []
     lower: dict[tuple[int, int], Any] = {}

@@ -1,4 +1,4 @@
-"""The packed algebra of a path: the Kalman filter of a model linearised along its own trajectory, as assignments."""
+"""Kalman filter of a model linearised along its own trajectory, with likelihood, gradient and Fisher information."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ from estimator.models.model import Model
 def linearised_filter_step(
     model: Model, propagation: Propagation, degree: int, follows_outputs: bool
 ) -> tuple[Assignments, dict[str, str]]:
-    """One sample of the Kalman filter of the model linearised along its own trajectory, at known coefficients.
+    """One sample of the filter at known coefficients, as assignments and results by row.
 
-    With Z the sensitivities of the state's mean, A its slope by the state and B by the coefficients (both in S),
+    With Z the sensitivities of the state's mean to the coefficients, A the Jacobian of the next state with respect to
+    the state and B with respect to the coefficients (both in S),
 
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
-    Names besides `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`: ``Q``, ``R_<sensor>`` and ``LIVE``, 0
-    where the sample is not counted.
+    Rows are `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`, the noise variances ``Q``
+    and ``R_<sensor>``, and ``LIVE``, which is 0 where the sample does not count.
 
     Args:
-        model: whose equation.
-        propagation: the motion over the sample.
-        degree: of the input's polynomial.
-        follows_outputs: whether the filter follows the outputs ``Y_<sensor>``, or the response without noise. The latter
-            leaves what the sensors show in ``SHOWN_<sensor>``, and the first one's predictive variance in ``SPREAD``.
+        model: the equation.
+        propagation: the dynamics over the sample.
+        degree: degree of the input's polynomial.
+        follows_outputs: update by the outputs ``Y_<sensor>``, or else follow the noise-free response.
+            The latter writes the predicted outputs into ``SHOWN_<sensor>``, and the first one's variance into
+            ``SPREAD``.
     """
     states, coefficients = list(model.states), list(model.coefficients)
     n, lines = len(states), Program()

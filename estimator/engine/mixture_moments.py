@@ -1,44 +1,52 @@
-"""The first two moments of mixtures of beliefs, one member after another, for several systems at once.
+"""Mean and covariance of mixtures of beliefs, compiled for several systems at once.
 
 With shares s_m, means x_m and covariances P_m, and x* the mean of one of the members,
 
     x = x* + Σ_m s_m (x_m - x*),   P = Σ_m s_m (P_m + (x_m - x)(x_m - x)ᵀ):
 
-so what all members know stays as it is, to the last bit. The noises' Gamma densities get the mean V and the variance
-of the noises' variances: that of a member is v_m = rate/shape, as it acts in an update, with the relative variance
-1/shape, and Σ_m s_m [(v_m/V)²/shape_m + (v_m/V - 1)²] is that of the mixture.
+a mean that all members share keeps its bits. The Gamma densities of the precisions match mean V and variance of the
+noise variances. A member has the noise variance v_m = rate/shape, as in an update, with relative variance 1/shape; the
+mixture has the relative variance Σ_m s_m [(v_m/V)²/shape_m + (v_m/V - 1)²].
 """
 
 from __future__ import annotations
 
 from functools import cache
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, NamedTuple
 
 from estimator.compilation.simd import LANES
 from estimator.engine.source_cache import load_generated
 
-#: Noises of a belief: of the process and of a sensor.
+#: Number of noises of a belief: process and sensor.
 N_NOISES = 2
 
 
-@cache
-def compile_mixture_moments(n_quantities: int) -> Any:
-    """The moments of beliefs in so many states and coefficients, of one sensor.
+class MomentSums(NamedTuple):
+    """Compiled sums over the members of mixtures, each for one member of n systems.
 
-    The functions are of one member of each of n systems. Their records lie in lanes ``at`` to ``at + n`` of a block B,
-    number i in row i (`estimator.Belief`), and their shares are S[s] to S[s + n]; what has no share does not count,
-    whatever its numbers. The mixtures' records lie in another block X, from lane 0 on.
+    The members' records lie in lanes ``at`` to ``at + n`` of a block B, number i of a record in row i
+    (`estimator.Belief`), and their shares are S[s] to S[s + n]. A member without share adds nothing, whatever its
+    numbers. The mixtures' records lie in another block X, from lane 0 on.
 
-    Returns:
-        A namespace of
-
-        - ``check(B, at, S, s, n)``: S becomes 0 where all numbers of the record are finite, and NaN elsewhere;
-        - ``means(B, at, S, s, A, X, n)``: adds s (x - x*) to X, with x* in the rows of a block A;
-        - ``spreads(B, at, S, s, X, n)``: adds s (P + (x - X)(x - X)ᵀ) and, in the rows of the rates, s v;
-        - ``tails(B, at, S, s, X, n)``: adds the relative variances of the noises in the rows of the shapes.
+    Attributes:
+        check: ``check(B, at, S, s, n)``: sets S to 0 where all numbers of the record are finite, else to NaN.
+        means: ``means(B, at, S, s, A, X, n)``: adds s (x - x*) to X, with x* in the rows of a block A.
+        spreads: ``spreads(B, at, S, s, X, n)``: adds s (P + (x - X)(x - X)ᵀ) and, in the rows of the rates, s v.
+        tails: ``tails(B, at, S, s, X, n)``: adds the noises' relative variances in the rows of the shapes.
     """
-    return load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
+
+    check: Any
+    means: Any
+    spreads: Any
+    tails: Any
+
+
+@cache
+def compile_mixture_moments(n_quantities: int) -> MomentSums:
+    """Compile the sums for beliefs in ``n_quantities`` states and coefficients, of one sensor."""
+    code = load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
+    return MomentSums(code.check, code.means, code.spreads, code.tails)
 
 
 def _source(n_quantities: int) -> str:

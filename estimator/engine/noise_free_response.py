@@ -1,13 +1,13 @@
-"""A model's motion without noise, at known coefficients, compiled for one system: what simple rules look at.
+"""Noise-free response of a model at known coefficients, with velocity, gain, regressors and linearisation, compiled.
 
-Besides the motion itself these are four things that every model has, and that Eq. (2) and Eq. (1) call by other names:
+These quantities exist for every model:
 
-- the *velocity* of the first sensor: its derivative by time without input. Of a difference equation that keeps the last
-  value of what the sensor shows it is the change since; of another, the change that comes without input.
-- the *gain*: how an input first shows, in the lowest derivative by time (or the first of the next samples) that depends
-  on it: η of Eq. (2), δ²/m of Eq. (1).
-- the *regressors*: derivatives of the moves by the coefficients.
-- the *linear part*: derivatives of the moves by the states, at rest.
+- the *velocity*: the time derivative of the first sensor's output without input. For a difference equation with the
+  last output among its states it is the change since the last sample; for another, the next change without input.
+- the *gain*: the slope, with respect to the input, of the lowest time derivative of the output (or the earliest next
+  output) that depends on the input: η of Eq. (2), δ²/m of Eq. (1).
+- the *regressors*: derivatives of the rates or next states with respect to the coefficients.
+- the *linear part*: their derivatives with respect to the states, at rest.
 """
 
 from __future__ import annotations
@@ -25,29 +25,27 @@ from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import integrator_rows
 from estimator.models.model import Model
 
-#: Runge-Kutta steps per sample of a plan that climbs by gradient, and of a glance at the motion. A filter needs an
-#: integration error far below the posterior's standard deviation, because it adds up over a record. A plan does not: it
-#: compares inputs, all imagined alike, by what they teach.
+#: Runge-Kutta steps per sample in gradient-based planning. A filter needs more, since its integration errors add up
+#: over a record; a plan compares inputs, all with the same error.
 _COARSE_SUBSTEPS = 2
 
 
 @dataclass(frozen=True)
 class NoiseFreeResponse:
-    """The motion of a model; all functions are of one system, or of as many as there are lanes, in a flat block ``W``.
+    """The noise-free response of a model, for the systems of a block ``W`` (`estimator.compilation.simd`).
 
-    Of several systems in a block, the quantity in row r of lane j is ``W[r * lanes + j]`` (`estimator.compilation.simd`).
-    The input of a sample stands in row ``INPUT``; older ones, where the model looks at them, in ``LAST_INPUT`` and
-    ``OLDER_INPUT``, and move on by themselves.
+    The input of a sample is in row ``INPUT``. Older inputs, if the model has them, are in ``LAST_INPUT`` and
+    ``OLDER_INPUT``; ``step`` shifts them.
 
     Attributes:
-        output_now: ``output_now(W)``: leaves in ``NOW`` what the first sensor shows now, without input, and its ``VELOCITY`` and
-            ``GAIN``.
-        output_after: ``output_after(W)``: leaves in ``SHOWN`` what it would show after the sample.
-        step: ``step(W)``: a sample; leaves ``SHOWN``, and in ``PHI_<coefficient>`` its derivatives by the coefficients.
-        regressors: ``regressors(W)``: the regressors, over all moves, into ``E_<coefficient>``.
-        linearise: ``linearise(W)``: the linear part into ``A_<state>_<state>``.
-        layout: rows of the block: states, coefficients, inputs, results.
-        is_odd: whether everything changes its sign with states and input.
+        output_now: ``output_now(W)``: writes the first sensor's output without input into ``NOW``, with its
+            ``VELOCITY`` and ``GAIN``.
+        output_after: ``output_after(W)``: writes the output after the sample into ``SHOWN``; the state stays.
+        step: ``step(W)``: one sample; writes ``SHOWN`` and its derivatives ``PHI_<coefficient>``.
+        regressors: ``regressors(W)``: writes the regressors, summed over all states, into ``E_<coefficient>``.
+        linearise: ``linearise(W)``: writes the linear part into ``A_<state>_<state>``.
+        layout: row number of each quantity: states, coefficients, inputs and results.
+        is_odd: whether rates (or next states) and outputs are odd functions of states and input.
     """
 
     output_now: Any
@@ -60,13 +58,20 @@ class NoiseFreeResponse:
 
 
 def with_coarse_substeps(model: Model) -> Model:
-    """The model with the steps of a plan that climbs by gradient, and of a glance at the motion."""
+    """The model with the integrator steps of gradient-based planning."""
     return replace(model, substeps=min(_COARSE_SUBSTEPS, model.substeps)) if model.is_continuous else model
 
 
 @cache
 def compile_noise_free_response(model: Model, degree: int = 0, lag: int = 0, lanes: int = 1) -> NoiseFreeResponse:
-    """The motion of a model; arguments as `estimator.engine.expected_update.compile_expected_update`, and the systems in a block."""
+    """Compile the noise-free response of a model.
+
+    Args:
+        model: the equation.
+        degree: as for `estimator.engine.expected_update.compile_expected_update`.
+        lag: likewise.
+        lanes: lanes of a block.
+    """
     coarse = with_coarse_substeps(model)
     names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"]
     names += [f"{letter}_{c}" for letter in ("PHI", "E") for c in model.coefficients]
@@ -96,7 +101,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     values = {"NOW_e": shown, "VELOCITY_e": velocity, "GAIN_e": gain}
     source = loop(
         "output_now",
-        "The sensor now.",
+        "The output now, without input.",
         symbolic.eliminate_common_subexpressions(values, "W"),
         {n.removesuffix("_e"): n for n in values},
     )
@@ -122,7 +127,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
 
 
 def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
-    """``output_after`` and ``step``."""
+    """Source of ``output_after`` and ``step``."""
     from estimator.engine import printer_numba, symbolic
 
     derivatives, symbol, states = symbolic.differentiate(model), symbolic.symbol, list(model.states)
@@ -130,7 +135,9 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     source, (lines, propagation) = "", symbolic.propagate_sample(model)
     if model.is_continuous:
         point = {f"M_{x}": f"M_{x}_E" for x in states}
-        source += loop("move_state", "As move, of the state alone.", symbolic.state_rk4_step(model, degree), point, "T")
+        source += loop(
+            "move_state", "One Runge-Kutta step of the state alone.", symbolic.state_rk4_step(model, degree), point, "T"
+        )
     at = dict(zip(map(symbol, states), propagation.state, strict=True)) | {
         symbol("u"): symbolic.input_at_end(model, degree)
     }
@@ -141,20 +148,20 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
         sum((output_slope[a] * propagation.jacobian[a][n + b] for a in range(n)), output_slope[n + b])
         for b in range(model.n_coefficients)
     ]
-    source += loop("output", "What the sensor will show.", [*lines, ("SHOWN_e", shown)], {"SHOWN": "SHOWN_e"})
+    source += loop("output", "The output after the sample.", [*lines, ("SHOWN_e", shown)], {"SHOWN": "SHOWN_e"})
     more = [("SHOWN_e", shown), *((f"PHI_{c}_e", e) for c, e in zip(model.coefficients, phi, strict=True))]
     more += [(f"END_{x}", value) for x, value in zip(states, propagation.state, strict=True)]
     results = {row: f"{row}_e" for row in ("SHOWN", *(f"PHI_{c}" for c in model.coefficients))}
     results |= {x: f"END_{x}" for x in states}
     results |= {older: newer for newer, older in pairwise(inputs)}
-    source += loop("finish", "What the sensor shows, by the coefficients too.", [*lines, *more], results)
+    source += loop("finish", "The output after the sample, and its derivatives.", [*lines, *more], results)
     for name, move, end in (("output_after", "move_state", "output"), ("step", "move", "finish")):
         source += printer_numba.print_sample(f"{name}(W)", model, f"{end}(W)", move)
     return source
 
 
 def _output_velocity_and_gain(model: Model) -> tuple[Any, Any, Any]:
-    """What the first sensor shows without input, its velocity, and its gain."""
+    """The first sensor's output without input, its velocity and its gain."""
     import sympy as sp
 
     from estimator.engine.symbolic import differentiate, symbol
@@ -165,7 +172,7 @@ def _output_velocity_and_gain(model: Model) -> tuple[Any, Any, Any]:
     shown = derivatives.outputs[0].xreplace({u: sp.S.Zero})
 
     def later(value: Any) -> Any:
-        """The derivative by time, or the value one sample later."""
+        """The time derivative, or the value one sample later."""
         if model.is_continuous:
             return sum(value.diff(x) * rate for x, rate in moves.items())
         return value.xreplace(moves)

@@ -10,13 +10,18 @@ from estimator.engine.symbolic import HALF, ZERO, Program, symbol
 
 
 class NoiseIteration(NamedTuple):
-    """What an iteration assumes and finds, in symbols.
+    """Assumptions and results of an iteration, in symbols.
 
     Attributes:
-        process_variance: E[w²] of unit process noise that it assumes, 1/E[γ].
-        q, r: variances of both noises in the output that it assumes.
-        weight, scaled_innovation: 1/S, and the innovation times it.
-        gamma_shape, gamma_rate, xi_shape, xi_rate: the beliefs that it finds.
+        process_variance: assumed variance of the process noise, 1/E[γ].
+        q: assumed variance of the output by process noise.
+        r: assumed variance of the sensor noise.
+        inverse_innovation_cov: 1/S.
+        scaled_innovation: e/S.
+        gamma_shape: resulting shape of q(γ).
+        gamma_rate: resulting rate of q(γ).
+        xi_shape: resulting shape of q(ξ).
+        xi_rate: resulting rate of q(ξ).
     """
 
     process_variance: sp.Expr
@@ -33,10 +38,17 @@ class NoiseIteration(NamedTuple):
 def iterate_noise_beliefs(
     program: Program, tag: str, sensor: str, scalars: tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr], iterations: int
 ) -> list[NoiseIteration]:
-    """The iterations over both noises, from s, e, hᵀ N h and whether the output is there.
+    """Iterate q(γ) and q(ξ) of a sensor (`estimator.engine.gaussian_update` has the formulas).
 
-    Both moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). That of the process noise is counted for
-    unit strength, so that nothing is divided by hᵀ N h, which may be 0 where the noise depends on the state.
+    Both second moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). The moment of the process noise is
+    for unit strength, so that no division by hᵀ N h occurs, which may be 0 where the noise depends on the state.
+
+    Args:
+        program: receives the assignments.
+        tag: the sensor's number, in their names.
+        sensor: the sensor's name.
+        scalars: s, e, hᵀ N h, and whether the output is observed.
+        iterations: number of iterations.
     """
     s, e, output_noise, is_observed = scalars
     gamma_rate, xi_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
@@ -44,7 +56,7 @@ def iterate_noise_beliefs(
     half_count = program.assign(f"U{tag}", HALF * is_observed)
     new_gamma_shape = program.assign(f"F{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
     new_xi_shape = program.assign(f"X{tag}", xi_shape + half_count)
-    # Divisions are dear, and every iteration has the same shapes.
+    # Every iteration has the same shapes, and divisions take long.
     inverse_gamma_shape = program.assign(f"V{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
     inverse_xi_shape = program.assign(f"A{tag}", 1 / new_xi_shape)
     process_variance = program.assign(f"B{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO

@@ -1,7 +1,7 @@
-"""From assignments to Python source that Numba compiles across lanes: the only module that knows how code is written.
+"""Printing assignments as Python source that is compiled across SIMD lanes.
 
-All quantities of some independent systems lie in one flat float64 array, the *block* ``W``: the quantity in row r of
-lane j is ``W[r * lanes + j]``. One array with constant offsets is what makes the loop over the lanes vectorise.
+All quantities of independent systems lie in one flat float64 array, the *block* ``W``: the quantity in row r of lane j
+is ``W[r * lanes + j]``. The constant offsets into one array let the compiler vectorise the loop over the lanes.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from sympy.printing.pycode import PythonCodePrinter
 from estimator.engine.symbolic import Assignments
 from estimator.models.model import Model
 
-#: Functions that are written out: a call is compiled on its own, and costs more than what it does. Arguments that stand
-#: there twice must be names.
+#: Function to its source, which is written in place of a call: a call would take longer to compile. An argument that
+#: occurs twice must be a name.
 _INLINE_TEMPLATES = {
     "present": "(1.0 if {0} == {0} else 0.0)",
     "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
@@ -29,7 +29,7 @@ _INLINE_TEMPLATES = {
 
 
 class _NumbaPrinter(PythonCodePrinter):
-    """Floats for numbers, products for small powers, bare names for functions."""
+    """Prints numbers as floats, small powers as products, and functions by bare names."""
 
     def _print_Integer(self, expr: sp.Integer) -> str:
         return f"{int(expr)}.0"
@@ -59,7 +59,7 @@ class _NumbaPrinter(PythonCodePrinter):
     _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_sign = _print_Function
 
     def _print_DiracDelta(self, expr: sp.DiracDelta) -> str:
-        # The slope of a sign, which no number is: it is 0 but at the jump, where a sign counts as 0, too.
+        # The derivative of a sign counts as 0, at the jump too.
         return "0.0"
 
 
@@ -82,19 +82,18 @@ def print_lane_loop(
     single_lane: bool = False,
     shared_rows: Mapping[str, int] | None = None,
 ) -> str:
-    """Source of a straight ``name(W, *uniform)``, which executes assignments in every lane of a block.
+    """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
     Args:
-        name: of the function.
-        assignments: in the order of execution; those that no result needs are left out.
-        results: row to the name (or number) whose value it receives.
-        layout: row to its number, or to an expression of it in uniform names. Rows that the assignments use are read
-            first.
-        lanes: systems in a block; the loop is left out for 1.
+        name: name of the function.
+        assignments: in the order of execution; assignments without effect on the results are left out.
+        results: row to the name (or number) of its new value.
+        layout: row to its number, or to an expression of the number in uniform names.
+        lanes: lanes of a block; 1 leaves the loop out.
         uniform: names that are the same in all lanes, and become arguments.
-        doc: a line for the reader.
-        single_lane: write ``name(W, j, *uniform)``, for lane j alone.
-        shared_rows: rows of another block ``B``, the second argument, whose memory many blocks may share.
+        doc: docstring of the function.
+        single_lane: write ``name(W, LANE, *uniform)``, for one lane.
+        shared_rows: rows of another block ``B``, the second argument, that several blocks may share.
 
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
@@ -107,12 +106,14 @@ def print_lane_loop(
     adjoint = any(row not in layout and row.removeprefix("G_") in layout for row in (*read, *results))
 
     def entry(row: str) -> str:
-        """Where a row lies; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
+        """A row's entry; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
         if shared_rows and row in shared_rows:
             return f"B[{shared_rows[row] * lanes}{' + LANE' if lanes > 1 else ''}]"
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
         if bare not in layout:
-            raise ValueError(f"{name} uses {row}, which no line assigns, no row holds and no argument brings")
+            raise ValueError(
+                f"{name} uses {row}, which is neither assigned, nor a row, nor an argument; add it to the layout"
+            )
         row_number = layout[bare]
         start = str(row_number * lanes) if isinstance(row_number, int) else f"({row_number}) * {lanes}"
         return f"{block}[{start}{' + LANE' if lanes > 1 else ''}]"
@@ -129,9 +130,13 @@ def print_lane_loop(
 
 
 def print_sample(signature: str, model: Model, finish_call: str, step_function: str = "move") -> str:
-    """Source of a straight function over a sample: ``begin(W)``, all steps ``step_function(W, T)``, and the ``finish_call``.
+    """Source of a function over a sample: ``begin(W)``, all Runge-Kutta steps, and the call that finishes it.
 
-    Of a difference equation the end is all.
+    Args:
+        signature: name and arguments of the function.
+        model: the equation; for a difference equation the function is ``finish_call`` alone.
+        finish_call: the last call.
+        step_function: name of ``step_function(W, T)``, one Runge-Kutta step from T in [0, 1) of the sample.
     """
     steps = model.substeps
     body = ["begin(W)", f"for s in range({steps}):", f"    {step_function}(W, s / {steps})"]
@@ -140,7 +145,7 @@ def print_sample(signature: str, model: Model, finish_call: str, step_function: 
 
 
 def _without_dead_code(assignments: Assignments, wanted: set[str]) -> tuple[Assignments, set[str]]:
-    """The assignments that what is wanted depends on, and the names that these and it need from elsewhere."""
+    """The assignments with effect on the wanted names, and the names that have to come from elsewhere."""
     kept: Assignments = []
     needed = set(wanted)
     for name, expression in reversed(assignments):
@@ -167,15 +172,15 @@ def print_scalar_function(
     uniform: Sequence[str] = (),
     doc: str = "",
 ) -> str:
-    """Source of a straight ``name(*arguments, *uniform)`` of tuples of scalars, which stay in registers.
+    """Source of ``name(*arguments, *uniform)`` on tuples of scalars, which stay in registers.
 
     Args:
-        name: of the function.
-        assignments: in the order of execution; those that no result needs are left out.
-        results: the names (or numbers) that each tuple returned holds; one tuple is returned by itself.
-        arguments: name of a tuple to the names that it holds.
+        name: name of the function.
+        assignments: in the order of execution; assignments without effect on the results are left out.
+        results: for each returned tuple, the names (or numbers) of its entries; a single tuple is returned bare.
+        arguments: name of a tuple to the names of its entries.
         uniform: further arguments, each a scalar.
-        doc: a line for the reader.
+        doc: docstring of the function.
 
     Raises:
         ValueError: for a name that is neither assigned nor an argument.
@@ -183,7 +188,7 @@ def print_scalar_function(
     kept, used = _without_dead_code(assignments, {value for group in results for value in group})
     available = {held for group in arguments.values() for held in group} | set(uniform)
     if unknown := sorted(used - available):
-        raise ValueError(f"{name} uses {unknown}, which no line assigns and no argument brings")
+        raise ValueError(f"{name} uses {unknown}, which are neither assigned nor arguments; add them to an argument")
     body = [f"({', '.join(held)},) = {group}" for group, held in arguments.items() if used & set(held)]
     body += [f"{target} = {print_expression(e)}" for target, e in kept]
     gathered = [f"({', '.join(group)},)" for group in results]

@@ -1,4 +1,4 @@
-"""What stands in the blocks of the engine: names of rows, in order."""
+"""Layout of the engine's blocks: names of their rows, in order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from estimator.models.model import Model
 
 
 def upper_triangle_names(matrix: str, names: Iterable[str]) -> list[str]:
-    """Names of a symmetric matrix's entries: its upper triangle, row by row."""
+    """Names of the upper triangle of a symmetric matrix, row by row."""
     return [f"{matrix}_{i}_{j}" for i, j in combinations_with_replacement(names, 2)]
 
 
@@ -26,9 +26,9 @@ def input_rows(model: Model, degree: int) -> list[str]:
 
 
 def integrator_rows(model: Model) -> list[str]:
-    """What a differential equation carries over its Runge-Kutta steps: M, S and N, or D where noise is held.
+    """Quantities that the integrator of a differential equation steps: M, S and N, or D where the noise is held.
 
-    Nothing for a difference equation.
+    Empty for a difference equation.
     """
     if not model.is_continuous:
         return []
@@ -37,13 +37,13 @@ def integrator_rows(model: Model) -> list[str]:
 
 
 def update_layout(model: Model, degree: int) -> dict[str, int]:
-    """Rows of an estimator's block: the belief, the sample, and what is carried over it."""
+    """Rows of an estimator's block: the belief, the sample, and the integrator."""
     outputs = [f"Y_{y}" for y in model.outputs]
     return number_rows(*belief_rows(model), *input_rows(model, degree), *outputs, *integrator_rows(model))
 
 
 def cubature_order(model: Model) -> list[str]:
-    """Quantities in the order of the rows of the sigma points' factor L."""
+    """States and coefficients in the order of the rows of the covariance's factor L: movers first."""
     return [*model.dynamic_names, *(name for name in model.names if name not in model.dynamic_names)]
 
 
@@ -57,7 +57,7 @@ def cubature_rows(model: Model) -> list[str]:
 
 
 def trace_rows(model: Model, iterations: int) -> list[str]:
-    """Rows that `structured` leaves for the free energy, per sensor."""
+    """Rows of the belief update with the terms of the free energy, per sensor."""
     names = []
     for k in range(model.n_outputs):
         names += [f"TRACE_{k}_{what}" for what in ("mean", "innovation", "variance", "shown")]
@@ -66,13 +66,13 @@ def trace_rows(model: Model, iterations: int) -> list[str]:
 
 
 def filter_state_rows(model: Model) -> list[str]:
-    """Where a path is: the filter's state, its covariance V, and its sensitivities Z to the coefficients."""
+    """State of the linearised filter: mean, covariance V, and sensitivities Z to the coefficients."""
     sensitivities = [f"Z_{i}_{c}" for i in model.states for c in model.coefficients]
     return [*model.states, *upper_triangle_names("V", model.states), *sensitivities]
 
 
 def likelihood_rows(model: Model) -> list[str]:
-    """What a path adds up: minus the log likelihood, its slope, the information (upper triangle), and Σ ν²/S."""
+    """Totals of the linearised filter: minus the log likelihood, its gradient, the Fisher information, and Σ ν²/S."""
     return [
         "LOSS",
         *(f"SLOPE_{c}" for c in model.coefficients),
@@ -84,7 +84,7 @@ def likelihood_rows(model: Model) -> list[str]:
 def linearised_filter_layout(
     model: Model, degree: int, follows_outputs: bool, variable_step: bool = False
 ) -> dict[str, int]:
-    """Rows of a path's block; ``SPAN`` is the length of a sample, where each has its own."""
+    """Rows of the linearised filter's block; ``SPAN`` is the length of a sample, if it varies."""
     seen = [f"{what}_{y}" for what in ("Y", "SHOWN", "SPREAD") for y in model.outputs]
     shown = seen if follows_outputs else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
     given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]

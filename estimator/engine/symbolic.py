@@ -1,15 +1,15 @@
-"""From a model to assignments: the calculus, by SymPy.
+"""Symbolic differentiation of a model by SymPy, as lists of assignments.
 
-Everything that the engine compiles is a list of assignments ``(name, expression)`` in the order of execution: the
-model's own expressions with their derivatives, one Runge-Kutta step of them, the packed algebra of a Gaussian, and the
-reverse of all these. Names of the engine begin with a capital letter:
+All that the engine compiles is a list of assignments ``(name, expression)`` in the order of execution: the model's
+expressions and derivatives, Runge-Kutta steps, Kalman updates, and the reverse derivative of these. Names of the engine
+begin with a capital letter:
 
 ==========  ===========================================================================================
 ``M_i``     state i after the sample, before its process noise
-``S_i_j``   its derivative by quantity j (a state before the sample, or a coefficient)
-``N_i_k``   covariance of states i and k that process noise of unit strength brings
-``P_i_j``   covariance of quantities i and j, and ``Q_i_j`` the predicted one
-``U_k``     the input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
+``S_i_j``   its derivative with respect to quantity j (a state before the sample, or a coefficient)
+``N_i_k``   covariance of states i and k by process noise of unit strength
+``P_i_j``   covariance of quantities i and j before the sample; ``Q_i_j`` is the predicted one
+``U_k``     input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
 ==========  ===========================================================================================
 """
 
@@ -28,7 +28,7 @@ Assignments = list[tuple[str, sp.Expr]]
 
 ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
 
-# Functions without branches, which `estimator.engine.printer_numba` writes out. NaN stays NaN, but in the first and third.
+# Functions that `estimator.engine.printer_numba` writes out, without branches.
 
 #: ``is_present(x)``: 0 where x is NaN, else 1.
 is_present = sp.Function("present")
@@ -43,10 +43,10 @@ clip = sp.Function("clip")
 
 
 class Program(Assignments):
-    """Assignments that grow."""
+    """A growing list of assignments."""
 
     def assign(self, name: str, expression: sp.Expr) -> sp.Expr:
-        """Assign, where the expression is more than a name or a number; what stands for it from now on."""
+        """Assign an expression to a name and return the name's symbol; a symbol or number is returned as it is."""
         if expression.is_Number or expression.is_Symbol:
             return expression
         self.append((name, expression))
@@ -54,7 +54,7 @@ class Program(Assignments):
 
 
 def _absolute_value(value: sp.Expr) -> sp.Expr:
-    """|value|. Of what SymPy does not know to be real, such as a logarithm, it would differentiate the parts."""
+    """|value|, as a square root where SymPy cannot prove that the value is real, such as a logarithm."""
     value = sp.sympify(value)
     return sp.Abs(value) if value.is_extended_real else sp.sqrt(value**2)
 
@@ -68,7 +68,7 @@ def symbol(name: str) -> sp.Symbol:
 
 
 def symmetric_entry(matrix: str, first: str, second: str, order: Sequence[str]) -> sp.Symbol:
-    """The symbol of a symmetric matrix's entry: of the two, the one that stands first in ``order`` comes first."""
+    """The symbol of a symmetric matrix's entry, with the two names sorted by ``order``."""
     if order.index(first) > order.index(second):
         first, second = second, first
     return symbol(f"{matrix}_{first}_{second}")
@@ -80,10 +80,10 @@ class ModelDerivatives:
 
     Attributes:
         moves: the rates or next states.
-        jacobian: (n, movers) derivatives of ``moves`` by `Model.is_dynamic`; the others need no sensitivity.
-        noise: how unit noise moves each state.
-        outputs: what each sensor shows.
-        output_slopes: of each sensor, the derivatives by all quantities.
+        jacobian: (n, movers) derivatives of ``moves`` with respect to `Model.dynamic_names`; all others are 0.
+        noise: coefficient of the unit noise in each state's rate or next value.
+        outputs: output of each sensor.
+        output_slopes: gradient of each output by all states and coefficients.
     """
 
     moves: tuple[sp.Expr, ...]
@@ -98,7 +98,7 @@ def differentiate(model: Model) -> ModelDerivatives:
     """Parse and differentiate a model.
 
     Raises:
-        ValueError: for text that is not an expression, or uses a name that the model does not have.
+        ValueError: for text that is not an expression, or has a name that is not the model's.
     """
     symbols = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
     moves = tuple(parse_expression(text, symbols, model.name) for text in model.update_expressions)
@@ -111,10 +111,15 @@ def differentiate(model: Model) -> ModelDerivatives:
 
 
 def parse_expression(text: str, symbols: Mapping[str, sp.Symbol], model_name: str) -> sp.Expr:
-    """An expression in known names.
+    """Parse an expression of a model.
+
+    Args:
+        text: the expression.
+        symbols: name to its symbol.
+        model_name: of the model, for messages.
 
     Raises:
-        ValueError: naming the text, for what is not an expression, or a name that is not known.
+        ValueError: with the text, for anything but an expression in these names.
     """
     names_in_expression(text, symbols, model_name)
     try:
@@ -135,27 +140,27 @@ def parse_expression(text: str, symbols: Mapping[str, sp.Symbol], model_name: st
 
 
 def eliminate_common_subexpressions(expressions: Mapping[str, sp.Expr], prefix: str) -> Assignments:
-    """Assignments of ``expressions`` that calculate common subexpressions once, as ``prefix_0``, ``prefix_1``, ..."""
+    """Assignments of ``expressions`` with common subexpressions assigned first, as ``prefix_0``, ``prefix_1``, ..."""
     symbols = sp.numbered_symbols(f"{prefix}_", real=True)
     parts, reduced = sp.cse(list(expressions.values()), symbols=symbols, optimizations=None)
     return [*((str(name), expression) for name, expression in parts), *zip(expressions, reduced, strict=True)]
 
 
 def substitute(assignments: Iterable[tuple[str, sp.Expr]], replacements: Mapping[str, sp.Expr | str]) -> Assignments:
-    """Assignments with other names, or expressions in the place of names."""
+    """Assignments with names replaced by other names, or by expressions."""
     mapping = {symbol(old): symbol(new) if isinstance(new, str) else new for old, new in replacements.items()}
     return [(str(mapping.get(symbol(name), name)), expression.xreplace(mapping)) for name, expression in assignments]
 
 
-# ---------------------------------------------------------------------------------------------- moving over a sample
-
-
 @dataclass(frozen=True)
 class Propagation:
-    """Where a sample moves the state: names or numbers of M, S and N after it, in symbols.
+    """The dynamics over a sample, in symbols.
 
-    ``jacobian`` is empty where the predicted covariance is not S P Sᵀ but stands in ``Q_i_j``. ``is_psd`` where N is
-    positive semi-definite by how it is made.
+    Attributes:
+        state: M, the state after the sample.
+        jacobian: S; empty if the predicted covariance is given as ``Q_i_j`` instead of S P Sᵀ.
+        noise_cov: N, the covariance of process noise of unit strength.
+        is_psd: whether N is positive semi-definite by construction.
     """
 
     state: tuple[sp.Expr, ...]
@@ -165,14 +170,14 @@ class Propagation:
 
 
 def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagation]:
-    """M, S and N of a difference equation: one evaluation of the next state and its derivatives."""
+    """M, S and N of a difference equation: the next state and its derivatives."""
     c = differentiate(model)
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
     for i, row in zip(model.states, c.jacobian, strict=True):
         named |= {f"S_{i}_{j}": slope for j, slope in zip(model.dynamic_names, row, strict=True)}
     lines = substitute(eliminate_common_subexpressions(named, "W"), inputs)
-    # What is a number or a bare name needs no line of its own.
+    # A number or a bare symbol needs no assignment.
     trivial = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
     lines = [(name, e) for name, e in lines if name not in trivial]
     value = lambda name: trivial.get(name, symbol(name))  # noqa: E731
@@ -185,7 +190,7 @@ def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagatio
 
 
 def integrator_start(model: Model) -> dict[str, sp.Expr]:
-    """What is carried, at the start of a sample."""
+    """The integrator's quantities at the start of a sample."""
     start: dict[str, sp.Expr] = dict.fromkeys(integrator_rows(model), sp.S.Zero)
     for i in model.states:
         start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
@@ -193,7 +198,7 @@ def integrator_start(model: Model) -> dict[str, sp.Expr]:
 
 
 def integrator_end(model: Model) -> Propagation:
-    """What is carried, as a sample leaves it."""
+    """The dynamics over a sample, from the integrator's quantities at its end."""
     states = list(model.states)
     jacobian = tuple(
         tuple(symbol(f"S_{i}_{j}") if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states
@@ -206,21 +211,21 @@ def integrator_end(model: Model) -> Propagation:
 
 
 def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
-    """What is left to assign at the end of a sample, and where it moved the state."""
+    """The assignments at the end of a sample, and the dynamics over it."""
     return ([], integrator_end(model)) if model.is_continuous else propagate_difference_equation(model)
 
 
 def runge_kutta_4(
     variables: Sequence[str], rate_assignments: Assignments, substeps: int, sample_length: sp.Expr = sp.S.One
 ) -> Assignments:
-    """One step of order 4, of a ``substeps``-th of a sample: from ``variables`` to ``<name>_E``.
+    """One Runge-Kutta step of order 4, from ``variables`` to ``<name>_E``.
 
-    What belongs to its four stages ends with ``_A`` to ``_D``, which no name of a model does.
+    Names of its four stages end with ``_A`` to ``_D``, which no name of a model does.
 
     Args:
-        variables: what moves.
-        rate_assignments: assignments of its derivatives ``K_<name>`` in the names and the input ``u``.
-        substeps: per sample.
+        variables: names that are integrated.
+        rate_assignments: assignments of their rates ``K_<name>`` in the names and the input ``u``.
+        substeps: steps per sample.
         sample_length: length of the sample, in sampling steps.
     """
     h = sample_length * sp.Rational(1, substeps)
@@ -251,7 +256,7 @@ def runge_kutta_4(
 
 
 def input_at_stages(degree: int, substeps: int) -> Assignments:
-    """``V_A``, ``V_B``, ``V_D``: the input at the start, middle and end of a Runge-Kutta step, by its polynomial."""
+    """``V_A``, ``V_B``, ``V_D``: the input at the start, middle and end of a Runge-Kutta step."""
     h = sp.Rational(1, substeps)
     lines = []
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
@@ -275,10 +280,15 @@ def state_rk4_step(model: Model, degree: int) -> Assignments:
 
 
 def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:
-    """Assignments of the state alone over a sample, or over a Runge-Kutta step of it, of renamed quantities.
+    """The state alone over a sample, or over one Runge-Kutta step, in renamed quantities.
+
+    Args:
+        model: the equation.
+        degree: degree of the input's polynomial.
+        row_of: state or coefficient to its name in the assignments.
 
     Returns:
-        The assignments, and what each of the renamed states becomes.
+        The assignments, and each renamed state to the name of its next value.
     """
     if model.is_continuous:
         mapping = {**row_of, **{f"M_{x}": row_of[x] for x in model.states}}
@@ -293,25 +303,28 @@ def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tup
 
 
 def input_at_end(model: Model, degree: int) -> sp.Expr:
-    """The input that a sensor sees: the newest tap, or the polynomial's value at the end of the sample."""
+    """The input at the time of the output: the newest tap, or the polynomial's value at the end of the sample."""
     return sum((symbol(f"U_{k}") for k in range(degree + 1)), sp.S.Zero) if model.is_continuous else symbol("U_0")
 
 
 def reverse_mode_derivative(
     assignments: Assignments, inputs: Sequence[str], result_adjoints: Mapping[str, str]
 ) -> Assignments:
-    """The reverse derivative of assignments: adjoints ``G_<name>`` of ``inputs``, from those of the results.
+    """Reverse-mode differentiation of assignments: adjoints ``G_<name>`` of ``inputs``.
 
     Args:
         assignments: forward, each name assigned once.
-        inputs: names whose adjoints are asked for.
-        result_adjoints: result to the name that holds its adjoint.
+        inputs: names whose adjoints are wanted.
+        result_adjoints: result to the name of its adjoint.
 
     Returns:
-        Assignments to run after the forward ones; those of ``inputs`` come last, as ``G_<name>``.
+        Assignments to execute after the forward ones; the adjoints of ``inputs`` come last.
+
+    Raises:
+        ValueError: for a name that is assigned twice.
     """
     if len({name for name, _ in assignments}) < len(assignments):
-        raise ValueError("assignments must assign every name once, to be reversed")
+        raise ValueError("assignments must assign every name once for the reverse derivative; rename the second")
     adjoints: dict[str, list[sp.Expr]] = {name: [symbol(seed)] for name, seed in result_adjoints.items()}
     lines: Assignments = []
     for name, expression in reversed(assignments):
@@ -322,7 +335,7 @@ def reverse_mode_derivative(
         lines.append((str(adjoint), sum(parts, sp.S.Zero)))
         inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
         for used in sorted(expression.free_symbols, key=str):
-            # The slope of 1/x needs no further division.
+            # The slope of 1/x is -(1/x)², without another division.
             slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
             adjoints.setdefault(str(used), []).append(slope * adjoint)
     lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]

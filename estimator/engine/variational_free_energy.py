@@ -1,4 +1,4 @@
-"""The free energy of a sample, from what the generated update leaves in its trace."""
+"""Variational free energy of a sample, from the trace of the compiled belief update."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def half_noise_powers(scaled_innovation, inverse_innovation_variance, q, r):
     """Half of E[w²] and of E[v²] under the Kalman step with noise variances q and r.
 
     Args:
-        scaled_innovation: the innovation, what was seen less what was predicted, times the weight.
-        inverse_innovation_variance: inverse of the prediction's variance with this sample's noises.
-        q: variance of the process noise as the sensor shows it, 1/E[γ].
-        r: variance of the sensor's noise, 1/E[ξ].
+        scaled_innovation: the innovation divided by its variance.
+        inverse_innovation_variance: inverse of the innovation's variance with q and r.
+        q: variance of the output by process noise, hᵀ N h / E[γ].
+        r: variance of the sensor noise, 1/E[ξ].
     """
     w = q * scaled_innovation
     v = r * scaled_innovation
@@ -30,18 +30,18 @@ def half_noise_powers(scaled_innovation, inverse_innovation_variance, q, r):
 
 @scalar_jit
 def precision_divergence(half_power, variance, shape, rate):
-    """What the belief in a precision adds: the moment and logarithm it moved to, and its divergence from the prior.
+    """Contribution of a precision's belief to the free energy: its divergence from the prior, and the expected terms.
 
-    The three have terms in ψ(shape + 1/2), and in half_power/(rate + half_power), that cancel.
+    The terms in ψ(shape + 1/2) and in half_power/(rate + half_power) cancel in the sum.
 
     Args:
         half_power: half of the noise's second moment.
-        variance: of the noise, as the iteration assumed it.
-        shape: of the precision before the sample.
-        rate: of the precision before the sample.
+        variance: the noise variance assumed by the iteration.
+        shape: shape of the precision before the sample.
+        rate: rate of the precision before the sample.
 
     Returns:
-        f and t: it adds ½ log f + t. The logarithms of a sample are taken of one product: they are most of the work.
+        f and t of the contribution ½ log f + t. One logarithm of the product of all f of a sample saves time.
     """
     precision = 1.0 / variance
     r, t = gamma_half_ratio(shape)
@@ -51,19 +51,19 @@ def precision_divergence(half_power, variance, shape, rate):
 def compile_free_energies(
     model: Model, iterations: int, lanes: int, layout: Mapping[str, int], every_iteration: bool = True
 ) -> Any:
-    """Compile ``f(W, out)``: the free energies [nats] that the last update left every lane with, after each iteration.
+    """Compile ``f(W, out)``: the free energies [nats] of the last update in every lane, after each iteration.
 
     F = KL[q(states, coefficients) || prior, transition, likelihood] + KL[q(γ) || prior] + KL[q(ξ) || prior] to first
-    order, summed over the sensors: the first that shows the process noise counts for γ and its own ξ, each further one
-    for its ξ. A missing output counts for nothing. ``out`` is (iterations * lanes,), or (lanes,), one iteration after
-    another; NaN where an update has left what is no variance.
+    order, summed over the sensors. The first sensor with process noise counts for γ and its ξ, each further one for its
+    ξ; a missing output counts 0. ``out`` is (iterations * lanes,), or (lanes,) for the last iteration; NaN where a
+    variance is not positive.
 
     Args:
-        model: whose belief.
-        iterations: of the update.
-        lanes: systems in a block.
-        layout: of the update, `estimator.engine.kernels.compile_belief_update` with ``trace=True``.
-        every_iteration: whether after every iteration, or only after the last.
+        model: the equation.
+        iterations: number of iterations of the update.
+        lanes: lanes of a block.
+        layout: layout of `estimator.engine.kernels.compile_belief_update` with ``keep_trace=True``.
+        every_iteration: after every iteration, or only after the last.
     """
     reported = range(iterations) if every_iteration else [iterations - 1]
 
@@ -75,14 +75,14 @@ def compile_free_energies(
                 found = f"F_{place}_{k}"
                 lines += [
                     f"y, e, s = {at(f'Y_{sensor}')}, {at(f'TRACE_{k}_innovation')}, {at(f'TRACE_{k}_variance')}",
-                    "# Shapes and rates before the sample; that of the process noise as the sensor shows it.",
+                    "# Shapes and rates before the sample; the rate of the process noise in units of the output.",
                     f"g, n = {at('GAMMA_SHAPE')} - 0.5, {at(f'XI_SHAPE_{sensor}')} - 0.5",
                     f"g_rate, n_rate = g * {at(f'TRACE_{k}_q_0')}, n * {at(f'TRACE_{k}_r_0')}",
                     f"q, r = {at(f'TRACE_{k}_q_{i}')}, {at(f'TRACE_{k}_r_{i}')}",
                     "weight = 1.0 / (s + q + r)",
                     "step = e * weight",
                     "half_w, half_v = half_noise_powers(step, weight, q, r)",
-                    "# The Gaussian's own evidence is ½ log 2πS + e²/2S at the noise variances of the iteration.",
+                    "# The Gaussian's evidence is ½ log 2πS + e²/2S at the noise variances of the iteration.",
                     "f, t = precision_divergence(half_v, r, n, n_rate)",
                     "f_w, t_w = precision_divergence(half_w, q, g, g_rate)",
                     "f, t = (f * f_w if q > 0.0 else f), (t + t_w if q > 0.0 else t)",

@@ -1,13 +1,12 @@
-"""A differential equation over a sample, by Runge-Kutta steps, with its sensitivities and its process noise.
+"""Runge-Kutta integration of a differential equation with its variational equations and process noise covariance.
 
-The sensitivities S are moved by exactly the derivative of the step's arithmetic, which is linear in them. With J the
-slopes of the rates at a stage, by the states and by the coefficients, and H the derivative of where the step ends by
-the rates of that stage,
+The sensitivities S follow the exact derivative of the step's arithmetic, which is linear in them. With J the Jacobian
+of the rates at a stage, by states and coefficients, and H the derivative of the step's end by the rates of that stage,
 
     H_D = h/6,   H_C = h/3 + h H_D J_D,   H_B = h/3 + h/2 H_C J_C,   H_A = h/6 + h/2 H_B J_B,
     S_E = S + Σ H J [S; 1].
 
-To take every column of S through the stages on its own is twice the work, and more than registers hold.
+Integrating every column of S through the stages would be twice the work, and exceed the registers.
 """
 
 from __future__ import annotations
@@ -32,17 +31,18 @@ from estimator.engine.symbolic import (
 )
 from estimator.models.model import Model
 
-#: Of each stage, in parts of a step: what its rates count at the end, and how far they move the next stage.
+#: Stage to the weight of its rates at the end of the step, and their weight in the next stage [steps].
 _STAGE_WEIGHTS = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Half),
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
-#: Runge-Kutta steps of the state over a sample that is only imagined: the first number where the model takes as many or
-#: more, else the second. What is linear takes one step, whose stages are begin, middle and end of the sample. Two steps
-#: are wrong by more than the noise where a period has five samples (tests/agents/test_imagination.py), and peaks then
-#: lie beyond where they are planned.
-_COARSE_STEPS, _MIN_COARSE_STEPS = 4, 2
+#: Runge-Kutta steps of the state over a predicted sample, for models with at least that many. Two steps have errors
+#: above the noise at five samples per period, and plans then exceed the output's limit.
+_COARSE_STEPS = 4
 
-#: Process noise that is held over a sample moves the state as one more coefficient would.
+#: Runge-Kutta steps over a predicted sample, for all other models.
+_MIN_COARSE_STEPS = 2
+
+#: Name of the held process noise, which has a column of sensitivities as a coefficient has.
 _HELD_NOISE = "HELD"
 
 _Slopes = dict[tuple[str, str], sp.Expr]
@@ -56,14 +56,14 @@ def print_integrator(
     input_values: Mapping[str, Any] | None = None,
     sample_length: sp.Expr = sp.S.One,
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, T)``, which carry a state over a sample.
+    """Source of ``begin(W)`` and ``move(W, T)``, which integrate a sample.
 
     Args:
-        model: whose state; of a difference equation the source is empty.
-        degree: of the input's polynomial.
-        layout: rows of the block.
-        lanes: systems in it.
-        input_values: the input ``U_k`` in other rows.
+        model: the equation; the source is empty for a difference equation.
+        degree: degree of the input's polynomial.
+        layout: row number of each quantity.
+        lanes: lanes of the block.
+        input_values: ``U_k`` to an expression in other rows.
         sample_length: length of the sample, in sampling steps.
     """
     if not model.is_continuous:
@@ -71,13 +71,15 @@ def print_integrator(
     start = {name: printer_numba.print_expression(value) for name, value in symbolic.integrator_start(model).items()}
     stepped = {name: f"{name}_E" for name in integrator_rows(model)}
     step = symbolic.substitute(variational_rk4_step(model, degree, sample_length), input_values or {})
-    source = printer_numba.print_lane_loop("begin", [], start, layout, lanes, doc="The point that moves, at the mean.")
-    doc = "One Runge-Kutta step, from T in [0, 1) of a sample on."
+    source = printer_numba.print_lane_loop(
+        "begin", [], start, layout, lanes, doc="The integrator at the start of a sample."
+    )
+    doc = "One Runge-Kutta step, from T in [0, 1) of the sample on."
     return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("T",), doc)
 
 
 def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.S.One) -> Assignments:
-    """One step of all that is carried (`estimator.engine.storage_layout.integrator_rows`), from ``<name>`` to ``<name>_E``."""
+    """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_E``."""
     states, h = list(model.states), sample_length * sp.Rational(1, model.substeps)
     stage, slopes = _stage_rates_and_slopes(model)
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("N", states))
@@ -110,9 +112,9 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
 
 
 def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
-    """Rates ``K_<name>`` of state and noise at the carried values and the input u, and slopes of the state's.
+    """Rates ``K_<name>`` of the state and its noise covariance, and the Jacobian of the state's rates.
 
-    Slopes that the stages do not share are assigned too, as ``J_<state>_<cause>``.
+    Entries of the Jacobian that differ between the stages are assigned too, as ``J_<state>_<quantity>``.
     """
     c, states = differentiate(model), list(model.states)
     at = {symbol(i): symbol(f"M_{i}") for i in states}
@@ -137,10 +139,10 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
 
 
 def coarse_trajectory(model: Model, degree: int) -> tuple[Assignments, dict[str, str]]:
-    """The state over a sample that is only imagined, in some Runge-Kutta steps: where it is in the middle, at the end.
+    """The noise-free state over a predicted sample, in few Runge-Kutta steps.
 
     Returns:
-        The assignments, and their names of ``MIDDLE_<state>`` and ``END_<state>``.
+        The assignments, and ``MIDDLE_<state>`` and ``END_<state>`` to the names of their values.
     """
     steps = _COARSE_STEPS if model.substeps >= _COARSE_STEPS else _MIN_COARSE_STEPS
     step = symbolic.state_rk4_step(replace(model, substeps=steps), degree)
@@ -155,10 +157,10 @@ def coarse_trajectory(model: Model, degree: int) -> tuple[Assignments, dict[str,
 
 
 def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic.Propagation]:
-    """A sample of a differential equation that is only imagined: M, S and N, where the path (`coarse_trajectory`) is known.
+    """M, S and N of a predicted sample of a differential equation, along `coarse_trajectory`.
 
-    The sensitivities take one step, through the slopes at the start, middle and end of the sample, which is much less
-    work than the path's. With H of its stages and g what unit noise adds to the rates, N is Simpson's rule:
+    The sensitivities take one step, with the Jacobians at the start, middle and end of the sample. With H of its stages
+    and g the coefficient of unit noise in the rates, N follows Simpson's rule:
 
         N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
@@ -174,8 +176,11 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
     noise_slopes: dict[str, list[sp.Expr]] = {}
     for tag in "DCBA":
         counts, reach = _STAGE_WEIGHTS[tag]
-        H = {(i, k): lines.assign(f"H_{i}_{k}_{tag}", (counts if i == k else 0) + reach * stage_slopes.get((i, k), sp.S.Zero))
-             for i in states for k in states}  # fmt: skip
+        H = {}
+        for i in states:
+            for k in states:
+                value = (counts if i == k else 0) + reach * stage_slopes.get((i, k), sp.S.Zero)
+                H[i, k] = lines.assign(f"H_{i}_{k}_{tag}", value)
         for i, j in total:
             product = sum((H[i, k] * slopes[tag][k, j] for k in states), sp.S.Zero)
             stage_slopes[i, j] = lines.assign(f"HJ_{i}_{j}_{tag}", product) if j in states else product
@@ -206,7 +211,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
 
 
 def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], u: sp.Expr, lines: Program) -> _Slopes:
-    """Slopes of the rates at a state and an input; what they have in common is assigned, with a tag."""
+    """Jacobian of the rates at a state and an input; common subexpressions are assigned to ``lines``, with a tag."""
     stage, slopes = _stage_rates_and_slopes(model)
     stage = [(name, value) for name, value in stage if not name.startswith("K_")]
     tagged = {name: f"{name}_{tag}" for name, _ in stage}

@@ -1,7 +1,6 @@
-"""Many records at once: the belief that each of them leaves, in a lane of its own.
+"""Posteriors of many records at once: one record per SIMD lane.
 
-The beliefs are those that `OnlineEstimator` would end with; a batch of records takes a fraction of the time that they
-take one by one.
+The posteriors are the same as from `OnlineEstimator`, in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from estimator.engine import kernels
 from estimator.engine.storage_layout import belief_rows
 from estimator.inference import mean_field
 from estimator.inference.input_interpolation import input_stencil, record_lengths, rig_input_degree
+from estimator.inference.record_filter import outputs_by_sensor
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
 from estimator.support.argument_checks import to_float_array
@@ -29,27 +29,25 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
 
     Args:
         u: (n, T) inputs. A record ends before its first NaN, so that episodes of different lengths fit into one array.
-        y: (n, T) outputs, paired with u by index as the rig says; (n, T, sensors) where there are several.
-        prior: `Belief` before the first sample, of all records; its factorisation is that of the updates.
-        rig: what the inputs do. Where it is None, pairs are those of an environment: a difference equation's t-th
-            input acts on the state before the t-th output, and a differential equation's input goes linearly from the
-            one before to it. Not ``look_ahead`` or ``spline``, nor a difference equation with a delay of -1, whose
-            samples wait for the input after them.
+        y: (n, T) outputs, paired with u by index as the rig says; (n, T, sensors) of several sensors.
+        prior: `Belief` before the first sample of every record; the updates use its factorisation.
+        rig: timing and interpolation of the inputs. None is the timing of an environment: the t-th input of a
+            difference equation acts on the state before the t-th output, and the input of a differential equation is
+            linear between samples. ``look_ahead``, ``spline`` and a delay of -1 are refused, since their samples wait
+            for a later input.
 
     Returns:
         The n posteriors, each after the last sample of its record.
 
     Raises:
-        ValueError: for shapes that do not fit, a prior of another kind, or another rig.
+        ValueError: for shapes that do not fit, a prior that is no `Belief`, or a rig that is refused.
     """
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
-    inputs, outputs = to_float_array("u", u), to_float_array("y", y)
-    sensors = prior.model.n_outputs
-    if sensors == 1 and outputs.shape == inputs.shape:
-        outputs = outputs[..., None]
-    if inputs.ndim != 2 or outputs.shape != (*inputs.shape, sensors):
-        raise ValueError(f"u and y must have one shape (n, T), but have {inputs.shape} and {np.shape(y)}")
+    inputs = to_float_array("u", u)
+    outputs = outputs_by_sensor(prior.model, inputs, y)
+    if inputs.ndim != 2:
+        raise ValueError(f"u must have shape (n, T), but has {inputs.shape}; pass u[None] for one record")
     rig = Rig(prior.step, "linear") if rig is None else rig
     input_window = input_stencil(prior.model, rig)
     if input_window.repeats_first:
@@ -61,7 +59,9 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     lengths = record_lengths(inputs)
     for row, length in enumerate(lengths):
         if not (np.isfinite(inputs[row, :length]).all() and np.isfinite(outputs[row, :length]).all()):
-            raise ValueError(f"u and y must be finite up to the end of a record, but those of record {row} are not")
+            raise ValueError(
+                f"u and y must be finite up to the end of a record, but in record {row} they are not; cut it before"
+            )
     inputs = np.concatenate([np.zeros((len(inputs), input_window.n_past)), inputs], axis=1)
     records = np.repeat(prior.record[None], len(inputs), axis=0)
     run = _compile_batch_filter(prior.model, rig_input_degree(prior.model, rig), prior.factorisation)
@@ -72,11 +72,11 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
 
 @cache
 def _compile_batch_filter(model: Model, degree: int, factorisation: str) -> Any:
-    """``run(inputs, outputs, lengths, prior, stencil, records)`` of a model."""
+    """Compile ``run(inputs, outputs, lengths, prior, stencil, records)`` of a model."""
     iterations = DEFAULT_ITERATIONS[factorisation]
     if factorisation == "mean_field":
         layout = mean_field.mean_field_layout()
-        update_all = mean_field.compile_mean_field_loop(layout)
+        update_all = mean_field.compile_mean_field_update(layout)
     else:
         belief_update = kernels.compile_belief_update(model, degree, iterations=iterations)
         layout, update_all = dict(belief_update.layout), belief_update.update

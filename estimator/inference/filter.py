@@ -1,4 +1,4 @@
-"""The memory of an online estimator: a belief, or several weighed ones, and the inputs that still act."""
+"""The filter of an online estimator: a belief, or a mixture over noise hypotheses, and the inputs that still act."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from estimator.settings import EstimatorSettings
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
-#: Shape of a Gamma belief that further samples do not move.
+#: Shape of a Gamma belief that stays under updates [1].
 _CERTAIN_SHAPE = 1e15
 
-#: What rounding may leave below zero of the eigenvalues of a covariance, in units of its standard deviations.
+#: Magnitude of a negative eigenvalue of a correlation matrix that rounding may leave [1].
 _EIGENVALUE_TOLERANCE = 1e-5
 
 
 class Filter:
-    """Memory for any model.
+    """Filter of any model.
 
     Args:
-        prior: belief before the first sample, one sample before it.
-        rig: what the inputs do.
-        settings: how it learns.
+        prior: belief one sample before the first.
+        rig: timing and interpolation of the inputs.
+        settings: options of the updates.
     """
 
     def __init__(self, prior: Belief, rig: Rig, settings: EstimatorSettings) -> None:
@@ -71,7 +71,7 @@ class Filter:
         self._write_records(records)
 
     def _initial_weights(self, records: FloatArray) -> FloatArray:
-        """(members,) the first weights. Of a rig whose guess is a prior, each noise is unknown by itself."""
+        """(members,) weights before the first sample. With the prior of a rig's guess, both noises are unknown."""
         unknown = self.rig.guess is not None and isinstance(self.settings.noise_hypotheses, tuple)
         return initial_weights(records, equal_effect_log_ratio(self.prior) if unknown else None)
 
@@ -100,16 +100,16 @@ class Filter:
 
     @property
     def members(self) -> int:
-        """Number of weighed beliefs."""
+        """Number of noise hypotheses."""
         return len(self._weights)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether the next sample only waits for the one after it."""
+        """Whether the next sample is only stored, until the input after it is known."""
         return self.input_stencil.lookahead and not self._begun[0]
 
     def step(self, u: float, y: float, energies: FloatArray, forecasts: FloatArray) -> int:
-        """Take one sample of one sensor; see `run`."""
+        """Update by one sample of one sensor; see `run`."""
         self._inputs[-1] = u
         self._outputs[-1, 0] = y
         overflowed_at: int = self._loop.run(
@@ -119,16 +119,16 @@ class Filter:
         return overflowed_at
 
     def run(self, u: FloatArray, y: FloatArray, energies: FloatArray, forecasts: FloatArray) -> int:
-        """Take samples; one that waits for a later input is used by the next call.
+        """Update by samples; a sample that waits for a later input is used by the next call.
 
         Args:
             u: (T,) inputs.
             y: (T, sensors) outputs.
-            energies: (T or more, iterations) receives the free energies, from the front; empty to follow blindly.
-            forecasts: (T or more, sensors, 2) receives means and variances of the outputs before they were seen.
+            energies: (T or more, iterations) receives the free energies, from the front; empty to skip all checks.
+            forecasts: (T or more, sensors, 2) receives the predictive means and variances of the outputs.
 
         Returns:
-            The sample at which the numbers overflowed, or -1. Nothing has changed where they did.
+            The sample at which the numbers overflowed, and then nothing has changed; or -1.
         """
         at_once = self.input_stencil.needs_whole_record
         inputs = (
@@ -145,7 +145,7 @@ class Filter:
         return max(0, overflowed_at - int(self.input_stencil.lookahead)) if overflowed_at >= 0 else -1
 
     def rewind(self) -> None:
-        """Forget the state and the inputs; keep coefficients, noises and weights."""
+        """Reset the state and the inputs; keep coefficients, noises and weights."""
         records, n = self.records, self.model.n_states
         of_states = np.concatenate([np.arange(n), covariance_indices(self.model)[:n].reshape(-1)])
         records[:, of_states] = self._first[of_states]
@@ -156,7 +156,7 @@ class Filter:
 
     @property
     def records(self) -> FloatArray:
-        """(members, size) the flat records of all beliefs; a copy."""
+        """(members, size) flat records of all beliefs; a copy."""
         blocks, lanes, size = len(self._block), self._loop.lanes, len(self._first)
         rows = self._block[:, : size * lanes].reshape(blocks, size, lanes)
         return rows.transpose(0, 2, 1).reshape(blocks * lanes, size)[: self.members].copy()
@@ -167,12 +167,12 @@ class Filter:
 
     @property
     def belief(self) -> Belief:
-        """The belief now, with the mixture's moments where there are several."""
+        """The current belief; for several hypotheses, with the moments of their mixture."""
         return self.prior.with_records(self._mixture_record()[None])[0]
 
     @property
     def noise_ratio(self) -> NoiseRatio:
-        """What the weights say, at the precisions that each member has learned."""
+        """Posterior of the noise ratio, from the weights and the precisions of the members."""
         weights, _ = compile_mixture(len(self.model.names)).mixture(self._block, self._weights)
         ratios = np.array([log_noise_ratio(record[-4:]) for record in self.records[weights > 0]])
         records = member_priors(self.prior, self.settings.noise_hypotheses)
@@ -180,7 +180,7 @@ class Filter:
         return noise_ratio_posterior(weights[weights > 0], ratios, first, self._initial_weights(records))
 
     def _mixture_record(self) -> FloatArray:
-        """(size,) a record with the mixture's moments."""
+        """(size,) record with the mixture's moments."""
         if self.members == 1:
             return self.records[0]
         record: FloatArray = compile_mixture(len(self.model.names)).mixture(self._block, self._weights)[1]
@@ -188,7 +188,7 @@ class Filter:
 
     @property
     def is_paper_model(self) -> bool:
-        """Whether the model is the paper's, which is judged by measured outputs as they are."""
+        """Whether the model is the paper's, whose predictions start from measured outputs."""
         return self.model == difference()
 
     def predict(self, u: FloatArray, y: FloatArray) -> FloatArray:
@@ -207,7 +207,7 @@ class Filter:
         unseen = np.full((len(u) - given, y_init.shape[1]), np.nan)
         filter_at_mean = self.with_known_parameters(state=y_init[::-1][:2, 0] if self.is_paper_model else None)
         if self.is_paper_model:
-            # The state is measured: what acts from now on are the inputs, with those that the delay holds back.
+            # The state is measured; the inputs that still act are the new ones and the delayed ones.
             kept = filter_at_mean.input_stencil.n_past
             filter_at_mean._inputs[:-1] = np.concatenate([np.zeros(kept), u[:given]])[given:]
             return (
@@ -220,7 +220,7 @@ class Filter:
         return forecasts
 
     def with_known_parameters(self, state: FloatArray | None = None) -> Filter:
-        """A filter that knows coefficients and noises, and the state where it is given."""
+        """A filter with coefficients and noises fixed at their means, and the state too if it is given."""
         n, d = self.model.n_states, len(self.model.names)
         record, places = self._mixture_record(), covariance_indices(self.model)
         cov = np.zeros((d, d))
@@ -232,14 +232,14 @@ class Filter:
         record[places] = cov
         noises = record[-2 - 2 * self.model.n_outputs :]
         noises *= np.repeat(_CERTAIN_SHAPE / noises[::2], 2)
-        # As many iterations as the filter itself takes, though one were enough: that loop is compiled.
+        # One iteration would be enough, but the loop with the filter's own number is compiled already.
         settings = replace(self.settings, drift=0.0, noise_hypotheses=1)
         if settings.factorisation == "mean_field":
             settings = EstimatorSettings()
         return Filter(self.prior.with_records(record[None])[0], self.rig, settings)
 
     def forecast(self, u: FloatArray, y: FloatArray) -> FloatArray:
-        """(T, sensors, 2) mean and variance of each output before it is seen; the end may wait for an input in vain."""
+        """(T, sensors, 2) predictive mean and variance of each output."""
         forecasts = np.empty((len(u) + 1, y.shape[1], 2))
         no_energies = np.empty((0, 1))
         used = len(u) - int(self.is_waiting)
@@ -249,7 +249,7 @@ class Filter:
         return forecasts[: len(u)]
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Everything that the future depends on, by name; copies."""
+        """The complete state of the filter, by name; copies."""
         return {
             "records": self.records,
             "weights": self._weights.copy(),
@@ -261,10 +261,10 @@ class Filter:
         }
 
     def restore(self, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        """Become what `arrays` said of a filter with the same settings; all of it, or nothing.
+        """Set the state to the `arrays` of a filter with the same settings; an error changes nothing.
 
         Raises:
-            ValueError: naming the array, for one that is missing, unknown, or none that such a filter can have.
+            ValueError: naming the array, if it is missing, unknown or impossible for such a filter.
         """
         expected = self.arrays()
         if set(arrays) != set(expected):
@@ -284,7 +284,7 @@ class Filter:
         for name, records in (("records", checked["records"][alive]), ("first", checked["first"][None])):
             for record in records:
                 check_belief_record(name, self.model, record, _EIGENVALUE_TOLERANCE)
-        if self.members > 1:  # their moments together may overflow, or vanish, where none of them does
+        if self.members > 1:  # the mixture's moments may overflow, or vanish, where no member's do
             blocks = pack_into_lanes(checked["records"], self._loop.lanes)
             _, record = compile_mixture(len(self.model.names)).mixture(blocks, weights)
             check_belief_record("records", self.model, record, _EIGENVALUE_TOLERANCE)
@@ -295,19 +295,19 @@ class Filter:
 
 
 def _checked_array(name: str, value: npt.ArrayLike, expected: FloatArray) -> FloatArray:
-    """A copy of an array of the right kind."""
+    """A copy of a float64 array of the expected shape and range."""
     array = to_float_array(name, value)
     if np.asarray(value).dtype != np.float64 or array.shape != expected.shape:
         raise ValueError(
             f"{name} must be float64 of shape {expected.shape}, but is {np.asarray(value).dtype} of {array.shape}; use "
             f"arrays() of an estimator with the same settings"
         )
-    # A member without weight may have overflowed, and an output that waits may be missing.
+    # A member without weight may have overflowed, and a stored output may be missing.
     if name not in ("records", "outputs") and not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, but is {array.tolist()}; use arrays() of an estimator")
     if name == "outputs" and np.isinf(array).any():
         raise ValueError(f"outputs must be finite or missing, but are {array.tolist()}; use arrays() of an estimator")
-    # Of beliefs `check_belief_record` says what is too large.
+    # `check_belief_record` has the range of beliefs.
     if (
         name not in ("records", "first")
         and (np.abs(array) > (most := MAGNITUDE_BOUNDS[1] ** (1 + (name == "walk")))).any()

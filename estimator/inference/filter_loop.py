@@ -1,7 +1,7 @@
-"""One compiled function that takes samples, for any model: the loop of the online estimator.
+"""The compiled loop of the online estimator over samples, for any model.
 
-A block ``W`` holds one system, or `LANES` hypotheses about the noises of one. Each sample lets the coefficients walk,
-puts the inputs into their rows, updates, and judges every member by its free energy.
+A block ``W`` holds one system, or `LANES` noise hypotheses of one. For each sample the loop adds the random walk of the
+coefficients, writes the inputs into their rows, updates the beliefs, and weighs the hypotheses by free energy.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from estimator.models.model import Model
 
 @dataclass(frozen=True)
 class FilterLoop:
-    """A compiled loop over samples, and its block.
+    """A compiled loop over samples, and the layout of its block.
 
     Attributes:
         run: ``run(W, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts)``, which
             returns -1, or the number of the sample at which the numbers overflowed; then nothing has changed.
 
-            - W: (blocks, rows * lanes), the members' systems one after the other.
+            - W: (blocks, rows * lanes), the members' systems one after another.
             - weights: (members,) of the hypotheses.
-            - begun: (1,) 0 before the first sample ever.
-            - inputs: those that still act, then a new one for each sample; the former are moved on.
-            - outputs: (samples, sensors), with the one that waits in front; NaN where missing.
+            - begun: (1,) 0 before the first sample ever, then 1.
+            - inputs: the past inputs that still act, then the new ones; the former are shifted.
+            - outputs: (samples, sensors), after the stored one; NaN where missing.
             - stencil: of `estimator.inference.input_interpolation.InputStencil`.
-            - steps: its stride, past, waits and fills, as int64.
+            - steps: its stride, n_past, lookahead and repeats_first, as int64.
             - walk: (K,) variances of the coefficients' random walk per sample.
-            - energies: (samples, iterations) receives the free energies [nats]; where it is empty nothing is judged.
-            - forecasts: (samples, sensors, 2) receives mean and variance of each output before it was seen.
-        layout: rows of the block.
-        lanes: systems in a block.
+            - energies: (samples, iterations) receives the free energies [nats]; empty to skip all checks.
+            - forecasts: (samples, sensors, 2) receives the predictive mean and variance of each output.
+        layout: row number of each quantity.
+        lanes: lanes of a block.
     """
 
     run: Any
@@ -56,7 +56,7 @@ class FilterLoop:
 def compile_structured_loop(
     model: Model, degree: int, iterations: int, expectations: str = "first_order", members: int = 1
 ) -> FilterLoop:
-    """The structured factorisation, with a lane for each member where there are several."""
+    """Compile the loop of the structured factorisation; several members take a lane each."""
     lanes = 1 if members == 1 else LANES
     belief_update = kernels.compile_belief_update(
         model,
@@ -104,7 +104,7 @@ def compile_structured_loop(
 
 @cache
 def compile_mean_field_loop(iterations: int, as_published: bool) -> FilterLoop:
-    """The paper's mean field, with or without the departures of the published run. It makes no forecasts."""
+    """Compile the loop of the paper's mean field, which gives no forecasts."""
     model = difference()
     layout = mean_field.mean_field_layout()
     begin, iterate, end, energy = mean_field.compile_mean_field(layout, lanes=1)
@@ -139,12 +139,12 @@ def _compile_loop(
     """Compile `FilterLoop.run` around an update.
 
     Args:
-        variant: names the compiled code; see `estimator.compilation.simd.jit_closure`.
-        model: whose rows.
-        layout: of the rows.
-        lanes: systems in a block.
-        scratch: numbers that ``update_block`` leaves in ``before`` for ``score_member``.
-        update_block: ``update_block(W, before)``: updates a block.
+        variant: identifies the compiled code; see `estimator.compilation.simd.jit_closure`.
+        model: the equation.
+        layout: row number of each quantity.
+        lanes: lanes of a block.
+        scratch: size of ``before``.
+        update_block: ``update_block(W, before)``: updates a block, and writes its free energies into ``before``.
         score_member: ``score_member(W, j, before, values, forecasts)``: free energies and forecasts of lane j.
     """
     sensors, is_single = model.n_outputs, lanes == 1
@@ -153,19 +153,19 @@ def _compile_loop(
 
     @kernel(variant=variant)
     def run(W, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
-        stride, past, waits, fills = steps[0], steps[1], steps[2], steps[3]
-        members, samples, iterations = len(weights), len(outputs) - waits, energies.shape[1]
+        stride, n_past, lookahead, repeats_first = steps[0], steps[1], steps[2], steps[3]
+        members, samples, iterations = len(weights), len(outputs) - lookahead, energies.shape[1]
         judged = energies.shape[0] > 0
         before = np.empty(scratch)
-        single, shares = np.empty((members, iterations)), np.empty((members, iterations))
+        member_energies, shares = np.empty((members, iterations)), np.empty((members, iterations))
         predictions = np.empty((members, sensors, 2))
         old_weights, backup = np.empty(members), np.empty((len(W), record_length))
         copy(old_weights, 0, weights, members)
         _copy_beliefs(backup, W, record_length)
-        first = 1 if waits and begun[0] == 0.0 else 0
-        if fills and begun[0] == 0.0:
-            for i in range(past):
-                inputs[i] = inputs[past]
+        first = 1 if lookahead and begun[0] == 0.0 else 0
+        if repeats_first and begun[0] == 0.0:
+            for i in range(n_past):
+                inputs[i] = inputs[n_past]
         overflowed_at = -1
         for t in range(first, samples):
             for b in range(len(W)):
@@ -173,16 +173,16 @@ def _compile_loop(
                 update_block(W[b], before)
                 for j in range(min(lanes, members - b * lanes)):
                     m = b * lanes + j
-                    score_member(W[b], j, before, single[m], predictions[m])
+                    score_member(W[b], j, before, member_energies[m], predictions[m])
             here = t - first
             if is_single or not judged:
                 for k in range(sensors):
                     forecasts[here, k, 0], forecasts[here, k, 1] = predictions[0, k, 0], predictions[0, k, 1]
             else:
-                _weigh_members(weights, single, shares, predictions, energies[here], forecasts[here])
+                _weigh_members(weights, member_energies, shares, predictions, energies[here], forecasts[here])
             if judged:
                 if is_single:
-                    copy(energies[here], 0, single[0], iterations)
+                    copy(energies[here], 0, member_energies[0], iterations)
                 if not _all_finite(energies[here]):
                     overflowed_at = t
                     break
@@ -191,13 +191,13 @@ def _compile_loop(
         if overflowed_at >= 0:
             _copy_beliefs(W, backup, record_length)
             copy(weights, 0, old_weights, members)
-            if fills and begun[0] == 0.0:
-                for i in range(past):
+            if repeats_first and begun[0] == 0.0:
+                for i in range(n_past):
                     inputs[i] = 0.0
             return overflowed_at
-        for i in range(past):
+        for i in range(n_past):
             inputs[i] = inputs[i + samples]
-        for i in range(waits):
+        for i in range(lookahead):
             for k in range(sensors):
                 outputs[i, k] = outputs[i + samples, k]
         begun[0] = 1.0
@@ -207,7 +207,7 @@ def _compile_loop(
 
 
 def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
-    """``load_sample(W, inputs, start, stencil, output, walk)``: the random walk, inputs and outputs before an update."""
+    """Compile ``load_sample(W, inputs, start, stencil, output, walk)``: random walk, inputs and outputs of a sample."""
     u_row = layout["U_0"] * lanes
     y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
     variance_rows = tuple(layout[f"P_{c}_{c}"] * lanes for c in model.coefficients)
@@ -236,25 +236,25 @@ def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int]
 
 
 @jit
-def _weigh_members(weights, single, shares, predictions, energies, forecasts):
+def _weigh_members(weights, member_energies, shares, predictions, energies, forecasts):
     """Weigh the members by a sample, and give the mixture's free energies and forecasts.
 
     Args:
         weights: (members,), updated.
-        single: (members, iterations) free energies of the members.
+        member_energies: (members, iterations) free energies of the members.
         shares: (members, iterations), overwritten with the weights after each iteration.
         predictions: (members, sensors, 2) means and variances.
         energies: (iterations,) receives the free energies of the mixture.
         forecasts: (sensors, 2) receives its means and variances.
     """
-    members, iterations = single.shape
+    members, iterations = member_energies.shape
     for m in range(members):
-        mark_diverged(single[m], predictions[m])
+        mark_diverged(member_energies[m], predictions[m])
         for i in range(iterations):
             shares[m, i] = weights[m]
-    apply_switching(shares, single)
+    apply_switching(shares, member_energies)
     forecast_mixture(shares, predictions, forecasts)
-    reweight(shares, single, energies)
+    reweight(shares, member_energies, energies)
     for m in range(members):
         weights[m] = shares[m, iterations - 1]
 

@@ -1,13 +1,12 @@
-"""What an experiment can tell at best: Fisher information and Cramér-Rao bounds, of any model.
+"""Fisher information of a model's coefficients, and Cramér-Rao bounds.
 
-The state is latent, so an output tells about the coefficients only what the past outputs did not. With the Kalman
-filter of the model linearised along its trajectory, ν_t the innovation, S_t its variance, s_t = -∂ν_t/∂(coefficients),
+The state is latent, so the information is in the innovations. With the Kalman filter of the model linearised along its
+trajectory, ν_t the innovation, S_t its variance and s_t = -∂ν_t/∂(coefficients),
 
     F = Σ_t s_t s_tᵀ / S_t,
 
-summed over the sensors too. What is left out is the sensitivity of the filter's gain and of S themselves: it enters F
-relative to the above by the squared ratio of noise to signal (1e-5 on the tracks), and what S tells needs noises that
-are known exactly. The sample's arithmetic is `estimator.engine.linearised_filter.linearised_filter_step`.
+summed over the sensors too. F omits the sensitivities of the gain and of S: their share is the squared ratio of noise
+to signal (1e-5 on the tracks), and information from S requires exactly known noises.
 """
 
 from __future__ import annotations
@@ -40,35 +39,35 @@ def fisher_information(
     interpolation: str = "zero_order",
     state_std: float = 0.0,
 ) -> FloatArray:
-    """Fisher information of a model's coefficients in the outputs that inputs bring about.
+    """Fisher information of a model's coefficients in its outputs, under given inputs.
 
     Args:
         model: the equation.
         coefficients: (K,) or (n, K), time counted in samples.
         u: (T,) or (n, T) inputs; the t-th acts over the sample that ends with the t-th output. A series ends before its
-            first NaN, so that episodes of different lengths fit into one array; before its first sample there was no
-            input.
-        process_noise: what the process noise of one sample alone does to the first sensor: standard deviation in its
-            unit, 0 or more; (n,) of a batch.
+            first NaN, so that episodes of different lengths fit into one array; before its first sample the input is 0.
+        process_noise: standard deviation of the first sensor's output by the process noise of one sample, in its unit,
+            0 or more; (n,) of a batch.
         measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of a batch.
-        y: (T,) or (n, T) the outputs that followed the inputs, or (..., T, p) those of p sensors: the information is
-            then taken along the filter's trajectory on them. Without them it is taken along the response without noise,
-            as a design needs it.
+        y: (T,) or (n, T) outputs, or (..., T, p) of p sensors: the linearisation is then along the filter's trajectory
+            on them. None is along the noise-free response, for experiment design.
         interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
-        state_std: standard deviation of every state about 0 at the start; by default the plant starts at rest.
+        state_std: standard deviation of every state about 0 at the start; by default it starts at rest.
 
     Returns:
         (K, K), or (n, K, K) where an argument is a batch. Not finite where the model blows up.
 
     Raises:
-        ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
+        ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
     degree = input_degree(Model.require_model(model), interpolation)
     noises = noise_variances(model, process_noise, measurement_noise)
     check_number("state_std", state_std, 0, MAX_MAGNITUDE, "0 is at rest")
     points, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
     if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
-        raise ValueError(f"coefficients must be of {list(model.coefficients)}, but have shape {points.shape}")
+        raise ValueError(
+            f"coefficients must be {list(model.coefficients)} on the last axis, but have shape {points.shape}"
+        )
     if inputs.ndim not in (1, 2):
         raise ValueError(f"u must have shape (T,) or (n, T), but has {inputs.shape}")
     outputs = None if y is None else outputs_by_sensor(model, inputs, y)
@@ -76,7 +75,9 @@ def fisher_information(
         shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-1], noises.shape[:-1])
     except ValueError:
         sizes = points.shape[:-1], inputs.shape[:-1], noises.shape[:-1]
-        raise ValueError(f"coefficients, u and noises must be batches of one size, but are of {sizes}") from None
+        raise ValueError(
+            f"coefficients, u and noises must be batches of one size, but have {sizes}; repeat the smaller"
+        ) from None
     rows, samples = int(np.prod(shape)), inputs.shape[-1]
 
     def broadcast(array: FloatArray, *last: int) -> FloatArray:
@@ -96,17 +97,16 @@ def fisher_information(
 
 
 def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = None) -> FloatArray:
-    """Lower bound of the error covariance of any estimate of the coefficients.
+    """Cramér-Rao bound: lower bound of the error covariance of any estimate of the coefficients.
 
-    Without a prior the bound holds for estimates without bias, at the system whose information is given. With one it
-    is the Bayesian bound (van Trees 1968): E[(error)(error)ᵀ] over systems and noise is at least (Λ0 + E[F])⁻¹, for
-    biased estimates too, and for inputs that were chosen by feedback, because these are functions of past outputs.
-    For that, pass the mean of F over systems that are drawn from the prior. Λ0 = E[∇log p ∇log pᵀ] is the inverse
-    covariance where the prior is Gaussian.
+    Without a prior the bound holds for unbiased estimates of one system. With a prior it is the Bayesian bound (van
+    Trees 1968): E[(error)(error)ᵀ] over systems and noise is at least (Λ0 + E[F])⁻¹, for biased estimates too, and for
+    feedback inputs, which are functions of past outputs. Pass then the mean of F over systems from the prior. Λ0 =
+    E[∇log p ∇log pᵀ] is the inverse covariance of a Gaussian prior.
 
     Args:
         information: (..., K, K) F, or its mean.
-        prior_precision: (K, K) Λ0; none where it is None.
+        prior_precision: (K, K) Λ0; None for no prior.
 
     Returns:
         (..., K, K) the bound.
@@ -123,8 +123,8 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
         raise ValueError(f"prior_precision must have shape {total.shape[-2:]}, but has {prior.shape}")
     total = total + prior
     if not np.isfinite(total).all():
-        raise ValueError("information must be finite, but has entries that are not; leave out systems that blew up")
-    # In units in which the diagonal is 1, because a cubic coefficient is informed a hundred times less than the others.
+        raise ValueError("information must be finite, but has entries that are not; leave out systems that diverged")
+    # In units with a diagonal of 1: a cubic coefficient has a hundredth of the information of the others.
     scale = np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = total / (scale[..., :, None] * scale[..., None, :])
@@ -136,19 +136,19 @@ def cramer_rao(information: FloatArray, prior_precision: FloatArray | None = Non
 def relative_covariance(
     model: Model, coefficients: npt.ArrayLike, covariance: npt.ArrayLike, scales: Scales = VOLT_SCALES
 ) -> FloatArray:
-    """Covariance of the relative errors of the physical parameters, to first order, from one of the coefficients.
+    """Covariance of the relative errors of the physical parameters, to first order, from the coefficients' covariance.
 
     Args:
-        model: whose parameters; of one without any, the coefficients themselves.
+        model: the equation; without physical parameters, the coefficients count as parameters.
         coefficients: (..., K).
         covariance: (..., K, K).
-        scales: what one inside is worth.
+        scales: units of the coefficients.
 
     Returns:
-        (..., p, p): the roots of its diagonal are coefficients of variation.
+        (..., p, p); the square roots of the diagonal are coefficients of variation.
 
     Raises:
-        ValueError: for something that is not a model, or shapes that do not fit it.
+        ValueError: for anything but a model, or shapes that do not fit it.
     """
     points, spread = to_float_array("coefficients", coefficients), to_float_array("covariance", covariance)
     k = Model.require_model(model).n_coefficients

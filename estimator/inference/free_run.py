@@ -1,4 +1,4 @@
-"""Free runs: what a plant with given coefficients does with an input, without noise; and what its sensor shows."""
+"""Free run: simulation of a model at given coefficients without noise."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ def free_run(
     state: npt.ArrayLike | None = None,
     interpolation: str = "zero_order",
 ) -> FloatArray:
-    """What the first sensor shows over a series of inputs; of one system, or of S at once.
+    """Simulate the first sensor's output over a series of inputs, for one system or S at once.
 
     Args:
         model: the equation.
         coefficients: (K,) or (S, K), time counted in samples.
-        u: (T,) or (S, T) inputs; the t-th acts over the sample that ends with the t-th output. Before the first there
-            was none.
-        state: (n,) or (S, n) where it starts; at rest where it is None.
-        interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
+        u: (T,) or (S, T) inputs; the t-th acts over the sample that ends with the t-th output. Before the first the
+            input is 0.
+        state: (n,) or (S, n) initial state; None is at rest.
+        interpolation: interpolation of the input between samples: ``zero_order``, or ``linear`` for a differential
+            equation.
 
     Returns:
-        (T,) outputs, or (S, T) where any argument is of S systems; inf or NaN from where the model blows up.
+        (T,) outputs, or (S, T) if any argument has S systems; inf or NaN after the model diverges.
 
     Raises:
-        ValueError: for shapes that do not fit, or what is no numbers.
+        ValueError: for shapes that do not fit, or anything but numbers.
     """
     values, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
     start = np.zeros(model.n_states) if state is None else to_float_array("state", state)
@@ -49,7 +50,7 @@ def free_run(
     if is_odd or values.shape[-1] != model.n_coefficients or start.shape[-1] != model.n_states:
         raise ValueError(
             f"coefficients, u and state must have shapes {(model.n_coefficients,)}, (T,) and {(model.n_states,)}, or "
-            f"one more axis, of systems, but have {values.shape}, {inputs.shape} and {start.shape}"
+            f"one more axis for systems, but have {values.shape}, {inputs.shape} and {start.shape}"
         )
     starts = np.empty((*systems, model.n_states + model.n_coefficients))
     starts[..., : model.n_states], starts[..., model.n_states :] = start, values
@@ -61,13 +62,13 @@ def free_run(
 
 
 def output_at(model: Model, coefficients: FloatArray, state: FloatArray, u: float) -> float:
-    """What the first sensor shows at a state, under an input that has been on for a while.
+    """Output of the first sensor at a state, under a constant input.
 
     Args:
         model: the equation.
         coefficients: (K,), time counted in samples.
         state: (n,).
-        u: the input, which an accelerometer feels at once.
+        u: the input, which acts on an accelerometer directly.
     """
     _, output_of = _compile_free_run(model, 0)
     return float(output_of(np.concatenate([state, coefficients]), float(u)))
@@ -75,7 +76,7 @@ def output_at(model: Model, coefficients: FloatArray, state: FloatArray, u: floa
 
 @cache
 def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
-    """``run(starts, u, y)`` of S systems and ``output_of(start, u)`` of one; a start holds states and coefficients."""
+    """Compile ``run(starts, u, y)`` and ``output_of(start, u)``; a start holds states and coefficients."""
     layout = number_rows(*model.names, *input_rows(model, degree), "SHOWN")
 
     def make() -> str:
@@ -83,11 +84,13 @@ def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
 
         lines, results = symbolic.propagate_state(model, degree, {name: name for name in model.names})
         uniform = ("T",) if model.is_continuous else ()
-        source = printer_numba.print_lane_loop("move", lines, results, layout, 1, uniform, doc="The state moves.")
+        source = printer_numba.print_lane_loop(
+            "move", lines, results, layout, 1, uniform, doc="One sample, or one Runge-Kutta step, of the state."
+        )
         end = symbolic.input_at_end(model, degree)
         shown = symbolic.substitute([("", symbolic.differentiate(model).outputs[0])], {"u": end})[0][1]
         return source + printer_numba.print_lane_loop(
-            "sense", [("S", shown)], {"SHOWN": "S"}, layout, 1, doc="The sensor."
+            "sense", [("S", shown)], {"SHOWN": "S"}, layout, 1, doc="The output."
         )
 
     code = load_generated(model.name, "free-run", repr((model.digest, degree)), make, RUNTIME_FUNCTIONS)

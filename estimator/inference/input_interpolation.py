@@ -1,6 +1,6 @@
-"""From recorded inputs to what a model takes over a sample: taps, or the coefficients of a polynomial.
+"""Interpolation of recorded inputs: the taps of a sample, or the coefficients of its polynomial.
 
-All are linear in a window of the inputs: row ``U_j`` is the sum of ``stencil[j]`` times the window.
+Both are linear in a window of the inputs: row ``U_j`` is the sum of ``stencil[j]`` times the window.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from estimator.models.model import Model
 from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
 
-#: Inputs that the look-ahead interpolation passes through: the last nine, and the next.
+#: Window of the look-ahead interpolation [inputs]: the last nine and the next.
 _LOOK_AHEAD_WINDOW = 10
 
-#: Of the spline through the inputs: they have power up to two thirds of the Nyquist frequency.
+#: Degree of the spline, for inputs with power up to two thirds of the Nyquist frequency.
 _SPLINE_DEGREE = INTERPOLATION_DEGREES["spline"]
 
 
 @dataclass(frozen=True, eq=False)
 class InputStencil:
-    """How a window of inputs drives a sample.
+    """Weights of a window of inputs in the input of a sample.
 
     Attributes:
-        stencil: (rows, window) of the inputs in the window, oldest first.
-        n_past: inputs before the newest that must be kept.
-        lookahead: whether a sample is used only when the next input is known.
-        repeats_first: whether the input before the first is taken as the first; as 0 otherwise.
-        needs_whole_record: whether all inputs must be known: then each sample has a window of its own, see `spline_coefficients`.
-        delay: of the rig.
+        stencil: (rows, window) weights of the inputs in the window, oldest first.
+        n_past: number of stored inputs before the newest.
+        lookahead: whether a sample waits for the next input.
+        repeats_first: whether the input before the record is its first input, or 0.
+        needs_whole_record: whether all inputs must be known; each sample has then the window of `spline_coefficients`.
+        delay: delay of the rig [samples].
     """
 
     stencil: FloatArray
@@ -46,11 +46,11 @@ class InputStencil:
 
     @property
     def stride(self) -> int:
-        """From a sample's window to the next one's."""
+        """Distance between the windows of two samples."""
         return len(self.stencil) if self.needs_whole_record else 1
 
     def spline_coefficients(self, u: FloatArray) -> FloatArray:
-        """(T, 6) coefficients of the quintic spline through all inputs (T,), on the way to each sample.
+        """(T, 6) coefficients of the quintic spline through all inputs (T,), over each sample.
 
         Raises:
             ValueError: for too few inputs.
@@ -72,10 +72,10 @@ class InputStencil:
 
 
 def input_stencil(model: Model, rig: Rig) -> InputStencil:
-    """The way of a model's input in a rig.
+    """Weights of the inputs in a sample of a model on a rig.
 
     Raises:
-        ValueError: for a delay in parts of a sample, or a lag, which only `identify` follows.
+        ValueError: for a fractional delay or a lag, which only `identify` supports.
     """
     delay = rig.integer_delay
     if not model.is_continuous:
@@ -90,24 +90,24 @@ def input_stencil(model: Model, rig: Rig) -> InputStencil:
 
 
 def record_lengths(series: FloatArray) -> npt.NDArray[np.int64]:
-    """Samples (n,) of each of some series (n, T), which may have none, before its first NaN."""
+    """(n,) number of samples of each series (n, T) before its first NaN."""
     return (~np.logical_or.accumulate(np.isnan(series), axis=1)).sum(axis=1)
 
 
 def rig_input_degree(model: Model, rig: Rig) -> int:
-    """Of the input's polynomial over a sample; 0 for a difference equation."""
+    """Degree of the input's polynomial over a sample; 0 for a difference equation."""
     return INTERPOLATION_DEGREES[rig.interpolation] if model.is_continuous else 0
 
 
 def _lagged_stencil(stencil: FloatArray, lag: int, repeats_first: bool = False) -> InputStencil:
-    """A window whose newest input for y[k] is u[k - lag]."""
+    """A stencil whose newest input for y[k] is u[k - lag]."""
     lookahead = lag < 0
     return InputStencil(np.ascontiguousarray(stencil), stencil.shape[1] - 1 + max(lag, 0), lookahead, repeats_first)
 
 
 @cache
 def _look_ahead_stencil() -> FloatArray:
-    """(6, _WINDOW) what each input of a window adds to the polynomial of its last interval but one."""
+    """(6, window) weights of the inputs of a window in the polynomial of its last interval but one."""
     from scipy.interpolate import make_interp_spline
 
     spline = make_interp_spline(np.arange(_LOOK_AHEAD_WINDOW), np.eye(_LOOK_AHEAD_WINDOW), k=_SPLINE_DEGREE)

@@ -1,14 +1,13 @@
-"""Maximum a posteriori: what a whole record says of the coefficients, to one who knows the noises and has time.
+"""Maximum a posteriori estimate of the coefficients from whole records, with known noise variances.
 
-An auditor for the online estimators, and for whoever chooses their inputs: it shares neither their updates nor their
-beliefs. With the Kalman filter's innovations ν_t and their variances S_t at the coefficients ψ of a model it minimises
+It audits the online estimators, and shares neither their updates nor their beliefs. With the innovations ν_t of the
+Kalman filter and their variances S_t at the coefficients ψ it minimises
 
     L(ψ) = ½ Σ_t (ν_t² / S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0)
 
-by Gauss-Newton steps (Λ0 + F)⁻¹, damped after Levenberg and Marquardt, with the sensitivities and the information F of
-`estimator.inference.fisher_information`. They begin at the prior's mean, and at other points where such are given: where the prior is
-wide, L has minima far from the truth, and the deepest that is found is kept. The inverse of Λ0 + F at the minimum is
-the posterior's covariance by Laplace's approximation.
+by Levenberg-Marquardt steps with the gradient and the information F of `estimator.inference.record_filter`. The search
+begins at the prior's mean and at further given points, and keeps the deepest minimum: with a wide prior, L has minima
+far from the truth. The inverse of Λ0 + F at the minimum is the covariance of Laplace's approximation.
 """
 
 from __future__ import annotations
@@ -31,11 +30,25 @@ from estimator.models.model import Model
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
-#: Steps at most, and the step at which the search ends, in standard deviations of the posterior.
-_MAX_STEPS, _STEP_TOLERANCE = 60, 1e-6
-#: Damping at the start, its change after a step that fails or succeeds, and where a system is given up.
-_INITIAL_DAMPING, _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 1e-4, 10.0, 0.1, 1e12
-#: Two minima whose depths differ by less are one.
+#: Upper limit of the steps of a search.
+_MAX_STEPS = 60
+
+#: Length of a step at which the search has converged [standard deviations of the posterior].
+_STEP_TOLERANCE = 1e-6
+
+#: Damping at the start, as a fraction of the curvature's diagonal [1].
+_INITIAL_DAMPING = 1e-4
+
+#: Factor on the damping after a step that raises the loss.
+_DAMPING_INCREASE = 10.0
+
+#: Factor on the damping after a step that lowers the loss.
+_DAMPING_DECREASE = 0.1
+
+#: Damping at which the search of a record fails [1].
+_MAX_DAMPING = 1e12
+
+#: Difference of the losses below which two minima count as one [nats].
 _MIN_LOSS_DIFFERENCE = 1e-3
 
 
@@ -44,9 +57,9 @@ class MapEstimate:
     """The posterior's mode and curvature, for n records.
 
     Attributes:
-        mean: (n, K) the most probable coefficients.
+        mean: (n, K) most probable coefficients.
         cov: (n, K, K) inverse of Λ0 + F there.
-        converged: (n,) whether the last step was small; where not, ``mean`` is the best point that was seen.
+        converged: (n,) whether the search converged; if not, ``mean`` is the best point found.
     """
 
     mean: FloatArray
@@ -71,17 +84,17 @@ def maximum_a_posteriori(
     Args:
         model: the equation.
         u: (n, T) inputs, likewise.
-        y: (n, T) the outputs that followed them, or (n, T, p) those of p sensors.
-        prior: of the coefficients, in the model's order, and of the state about rest. Its belief in the noises is not
-            used. A coefficient of variance 0 is known.
+        y: (n, T) outputs, or (n, T, p) of p sensors.
+        prior: belief in the coefficients and in the state about rest. Its noises are not used. A coefficient of
+            variance 0 is fixed.
         process_noise: standard deviation; (n,) of each record.
         measurement_noise: the sensors' standard deviations; (n, p) of each record.
-        interpolation: of the input between samples.
-        starts: (n, K) coefficients each, from which the records are fitted besides the prior's mean; of each record the
-            fit with the smallest L is kept. One that is not finite leads nowhere.
+        interpolation: interpolation of the input between samples.
+        starts: further starting points, each (n, K) coefficients; the fit with the smallest L is kept for each record.
+            A start that is not finite is ignored.
 
     Raises:
-        ValueError: naming the argument, for shapes that do not fit, or a number that is out of range.
+        ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
     inputs = to_float_array("u", u)
     if inputs.ndim != 2:
@@ -91,10 +104,12 @@ def maximum_a_posteriori(
     sample_inputs = inputs_by_sample(model, inputs, input_degree(model, interpolation))
     center, cov = prior.coefficients_mean, prior.coefficients_cov
     if center.shape != (model.n_coefficients,):
-        raise ValueError(f"prior must be of {list(model.coefficients)}, but its means have shape {center.shape}")
+        raise ValueError(
+            f"prior must have the coefficients {list(model.coefficients)}, but its means have shape {center.shape}"
+        )
     free = np.flatnonzero(np.diag(cov))
     free_block = np.ix_(free, free)
-    scale = np.sqrt(np.diag(cov)[free])  # all is solved in units of the prior, for its condition's sake
+    scale = np.sqrt(np.diag(cov)[free])  # in units of the prior, for a good condition number
     precision = np.linalg.inv(cov[free_block] / np.outer(scale, scale))
 
     def coefficients_at(points: FloatArray) -> FloatArray:
@@ -129,14 +144,14 @@ def maximum_a_posteriori(
 def _levenberg_marquardt(
     loss_and_derivatives: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-    """Go downhill from points (n, free).
+    """Minimise the losses of n records from points (n, free).
 
     Args:
-        loss_and_derivatives: loss, slope and curvature at points.
-        points: to begin with.
+        loss_and_derivatives: loss, gradient and curvature at points.
+        points: starting points.
 
     Returns:
-        Where it ended, the loss and the curvature there, and whether the last step was small.
+        The minima, the losses and curvatures there, and whether the searches converged.
     """
     points = points.copy()
     loss, gradient, curvature = loss_and_derivatives(points)
@@ -147,7 +162,7 @@ def _levenberg_marquardt(
         step = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
         step[converged | (damping > _MAX_DAMPING)] = 0.0
         new_loss, new_gradient, new_curvature = loss_and_derivatives(points + step)
-        better = new_loss <= loss  # False for what is not finite
+        better = new_loss <= loss  # False for NaN
         points[better] += step[better]
         loss, gradient = np.where(better, new_loss, loss), np.where(better[:, None], new_gradient, gradient)
         curvature = np.where(better[:, None, None], new_curvature, curvature)

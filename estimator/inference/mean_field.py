@@ -1,12 +1,12 @@
-"""Mean-field factorisation, the paper's: q(θ) q(η) q(γ) q(ξ) q(z_t) q(z_{t-1}), with z_t = (x_t, x_{t-1}).
+"""The paper's mean-field update: q(θ) q(η) q(γ) q(ξ) q(z_t) q(z_{t-1}), with z_t = (x_t, x_{t-1}).
 
-Messages 6 to 11 of Kouw (2020), Fig. 1 and Eq. (7), as closed-form updates: rank one for θ, 2×2 for z_{t-1}, where
-the factor of the transition is N(z_t | S z_{t-1} + s g(θ, z_{t-1}) + s η u, diag(1/γ, ε)) and expectations of
-g = θ1 x + θ2 x³ + θ3 x₋ are taken to first order. One iteration updates η, θ, z_t, z_{t-1}, γ, ξ, in this order; the
-prior factors of the step stay fixed during its iterations.
+Messages 6 to 11 of Kouw (2020), Fig. 1 and Eq. (7), as closed-form updates: rank one for θ, 2×2 for z_{t-1}. The
+transition is N(z_t | S z_{t-1} + s g(θ, z_{t-1}) + s η u, diag(1/γ, ε)), and expectations of g = θ1 x + θ2 x³ + θ3 x₋
+are taken to first order. One iteration updates η, θ, z_t, z_{t-1}, γ, ξ, in this order; the prior factors of a sample
+stay fixed during its iterations.
 
-The published run has two departures from the model, kept under ``as_published`` so that its numbers reproduce: the
-message to z_{t-1} lacks the linearisation offset g(m) - Jₓᵀm, and the rate of γ gets a further E[x_{t-1}]²/2.
+``as_published`` reproduces the numbers of the published run, which departs from the model twice: the message to z_{t-1}
+lacks the linearisation offset g(m) - Jₓᵀm, and the rate of γ gets a further E[x_{t-1}]²/2.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from estimator.engine.source_cache import variant_digest
 from estimator.engine.storage_layout import update_layout as layout_of_update
 from estimator.models.difference_equation import difference
 
-#: Precision of the identity x_{t-1} = x_{t-1} between z_t and z_{t-1}: 1/ε of the paper.
+#: Precision 1/ε of the identity between the x_{t-1} of z_t and of z_{t-1} [1/V²].
 TIE_PRECISION = 1e12
 
 _COVARIANCE_ROWS = """
     P_theta1_theta1 P_theta1_theta2 P_theta1_theta3 P_theta2_theta2 P_theta2_theta3 P_theta3_theta3 P_eta_eta
 """
 
-#: The prior factors of a sample, which its iterations share.
+#: The prior factors of a sample, fixed during its iterations.
 _PRIOR_FACTOR_ROWS = """
     prior_theta1 prior_theta2 prior_theta3 prior_eta
     prior_V_11 prior_V_12 prior_V_13 prior_V_22 prior_V_23 prior_V_33 prior_eta_variance
     prior_L_00 prior_L_01 prior_L_11 prior_h_0 prior_h_1 prior_gamma_rate prior_xi_rate prior_x1 prior_x2
 """
 
-#: The marginals of z_t = (z0, z1) and of z_{t-1} = (q0, q1), and what the free energy needs.
+#: The marginals of z_t = (z0, z1) and z_{t-1} = (q0, q1), and terms of the free energy.
 _MARGINAL_ROWS = "z0 z1 z0_variance q0 q1"
 _MOMENT_ROWS = """
     Q_00 Q_01 Q_11
     eta_information theta_information theta_shift residual_power error_power gamma_increment xi_increment
 """
 
-#: Rows that lie idle but during an update.
+#: Rows in use during an update only.
 SCRATCH_ROWS = tuple(f"{_PRIOR_FACTOR_ROWS} {_MARGINAL_ROWS} gamma xi {_MOMENT_ROWS}".split())
 
 
 class MeanFieldUpdate(NamedTuple):
-    """The update over the rows of a block.
+    """The compiled update over the rows of a block.
 
     Attributes:
-        begin: ``begin(W)``: the last marginals become this sample's prior factors.
-        iterate: ``iterate(W, as_published)``: the six updates.
-        end: ``end(W)``: q(z_t) becomes the state.
+        begin: ``begin(W)``: copies the last marginals into the sample's prior factors.
+        iterate: ``iterate(W, as_published)``: one iteration of the six updates.
+        end: ``end(W)``: copies q(z_t) into the state.
         free_energy: ``free_energy(W, j)`` of lane j after an iteration [nats]; before ``end``, or after it.
     """
 
@@ -64,12 +64,13 @@ class MeanFieldUpdate(NamedTuple):
 
 
 def compile_mean_field(layout: Mapping[str, int], lanes: int = LANES) -> MeanFieldUpdate:
-    """Compile the update for a block of ``lanes`` systems whose rows, and those of `SCRATCH_ROWS`, stand in ``mean_field_layout``."""
+    """Compile the update for a block with ``lanes`` lanes and the rows of `mean_field_layout`."""
     return MeanFieldUpdate(
         lanewise(layout, f"{_PRIOR_FACTOR_ROWS} {_MARGINAL_ROWS} gamma xi GAMMA_SHAPE XI_SHAPE_y", lanes=lanes)(begin),
         lanewise(
             layout,
-            f"theta1 theta2 theta3 eta {_COVARIANCE_ROWS} {_MARGINAL_ROWS} GAMMA_RATE XI_RATE_y gamma xi {_MOMENT_ROWS}",
+            f"theta1 theta2 theta3 eta {_COVARIANCE_ROWS} {_MARGINAL_ROWS} "
+            f"GAMMA_RATE XI_RATE_y gamma xi {_MOMENT_ROWS}",
             "as_published",
             lanes,
         )(iterate),
@@ -78,8 +79,8 @@ def compile_mean_field(layout: Mapping[str, int], lanes: int = LANES) -> MeanFie
     )
 
 
-def compile_mean_field_loop(layout: Mapping[str, int]) -> Any:
-    """``update(W, iterations, as_published)``: every lane's belief with its rows ``U_0`` and ``Y_y``."""
+def compile_mean_field_update(layout: Mapping[str, int]) -> Any:
+    """Compile ``update(W, iterations, as_published)``, which updates every lane's belief by its ``U_0`` and ``Y_y``."""
     begin, iterate, end, _ = compile_mean_field(layout)
 
     @jit_closure(variant_digest(sorted(layout.items())))
@@ -93,7 +94,7 @@ def compile_mean_field_loop(layout: Mapping[str, int]) -> Any:
 
 
 def mean_field_layout() -> dict[str, int]:
-    """Rows of a block: those of the paper's model, and `SCRATCH_ROWS`."""
+    """Rows of a block: the belief update of the paper's model, and `SCRATCH_ROWS`."""
     place = layout_of_update(difference(), 0)
     return place | number_rows(" ".join(SCRATCH_ROWS), first_row=len(place))
 
@@ -103,7 +104,7 @@ def begin(
     P_theta1_theta1, P_theta1_theta2, P_theta1_theta3, P_theta2_theta2, P_theta2_theta3, P_theta3_theta3, P_eta_eta,
     GAMMA_SHAPE, GAMMA_RATE, XI_SHAPE_y, XI_RATE_y,
 ):  # fmt: skip
-    """Make the last marginals this step's prior factors; the state's in information form (L, h)."""
+    """Copy the last marginals into the sample's prior factors; the state's factor in information form (L, h)."""
     determinant = P_x1_x1 * P_x2_x2 - P_x1_x2 * P_x1_x2
     l00 = P_x2_x2 / determinant
     l01 = -P_x1_x2 / determinant
@@ -124,7 +125,7 @@ def iterate(
     prior_L_00, prior_L_01, prior_L_11, prior_h_0, prior_h_1, prior_gamma_rate, prior_xi_rate,
     as_published,
 ):  # fmt: skip
-    """One iteration of the six updates. Both noises' shapes already count this sample."""
+    """One iteration of the six updates. The shapes of both precisions include this sample already."""
     u, y = U_0, Y_y
     # η: the residual E[x_t] - g under the last θ.
     regression = theta1 * q0 + theta2 * (q0 * q0 * q0) + theta3 * q1
@@ -212,7 +213,7 @@ def _residual_power(
 
 
 def end(z0, z1, z0_variance):
-    """Keep q(z_t) as the state belief; the coefficients and noises are in their rows already."""
+    """Copy q(z_t) into the state; coefficients and precisions are in their rows already."""
     return z0, z1, z0_variance, 0.0, 1.0 / TIE_PRECISION
 
 
@@ -222,10 +223,10 @@ def free_energy(
     z1, z0_variance, q0, q1, Q_00, Q_01, Q_11, gamma, xi,
     eta_information, theta_information, theta_shift, residual_power, error_power, gamma_increment, xi_increment,
 ):  # fmt: skip
-    """Free energy of this sample in nats after an iteration (before `end`), expectations of g to first order.
+    """Free energy of the sample after an iteration [nats], with expectations of g to first order.
 
     F = Σ KL[q || prior factor] over θ, η, z_{t-1}, γ, ξ, minus the entropy of q(z_t), minus the expected log
-    transition and log likelihood. θ and η moved by an update of rank one, so their divergences are scalars.
+    transition and log likelihood. The updates of θ and η have rank one, so their divergences are scalars.
     """
     eta_shift = (eta - prior_eta) * (eta - prior_eta) / prior_eta_variance
     coefficients = _rank_one_divergence(theta_information, theta_shift)

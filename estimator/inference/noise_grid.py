@@ -1,20 +1,20 @@
-"""Several hypotheses about how two noises share what an output shows: a mixture of structured filters.
+"""A grid of hypotheses about the process and measurement noise variances: a mixture of structured filters.
 
-An update sees the noises through the variance of the innovation only, S = s + q + r. With e = ν²/S - 1 it changes
+An update depends on the noises through the innovation's variance S = s + q + r alone. With e = ν²/S - 1 it changes
 
-    E[γ] by -e / (S (2a + 1)),   and E[ξ] by the same, where both shapes are a:
+    E[γ] by -e / (S (2a + 1)),   and E[ξ] by the same, if both shapes are a:
 
-the difference E[γ] - E[ξ] stays what the priors made it, and only the sum of the noises is learned. Which difference is
-the right one the sequence tells, by the evidence. So members with displaced priors learn side by side, each in a lane,
-and each is weighed by its free energies, F_m of a sample standing for -log p(y_t | y_1 ... y_{t-1}, m):
+the difference E[γ] - E[ξ] stays as in the priors, and only the sum of the noises is learned. The evidence of the whole
+sequence identifies the difference. So members with different priors are updated side by side, one per lane, and
+weighed by their free energies, F_m of a sample for -log p(y_t | y_1 ... y_{t-1}, m):
 
-    w_m <- (1 - ε) w_m + ε/M                       a hypothesis may become true again, in one sample of 1/ε
+    w_m <- (1 - ε) w_m + ε/M                       the true hypothesis may change, once in 1/ε samples
     F = -log Σ_m w_m exp(-F_m),   w_m <- w_m exp(F - F_m)        (`estimator.inference.noise_mixture.reweight`)
 
-The belief has the mixture's mean and covariance of states and coefficients, and its mean and variance of the noises'
-variances: those are what acts in a prediction, and a hypothesis of no noise at all must not make a precision infinite.
+The belief has the mixture's mean and covariance of states and coefficients, and the mixture's mean and variance of the
+noise variances, which act in a prediction: so a hypothesis without noise does not make a precision infinite.
 
-Where the outputs do not tell σ_w from 0, or σ_v, the first weights decide (`initial_weights`).
+If the outputs cannot distinguish σ_w or σ_v from 0, the first weights decide (`initial_weights`).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from estimator.compilation.simd import LANES
 from estimator.inference.noise_mixture import compile_mixture
 from estimator.support.array_types import FloatArray
 
-#: Furthest displacement of σ_w/σ_v from that of the prior, either way.
+#: Largest factor between σ_w/σ_v of a hypothesis and of the prior, up or down [1].
 MAX_RATIO_FACTOR = 30.0
 
-#: A number of ratios of the noises; or how many values of each are combined.
+#: Number of noise ratios; or the number of values of σ_w and of σ_v, which are combined.
 NoiseGridSize = int | tuple[int, int]
 
-#: Factor between two values of a noise's standard deviation.
+#: Factor between adjacent values of a noise's standard deviation [1].
 GRID_FACTOR = 3.0
 
-#: Displacements of the noises' total standard deviation. A member learns its total by itself, but slowly where the two
-#: noises are alike: what it loses meanwhile would be held against its ratio, were there no other of this ratio.
+#: Factors on the noises' total standard deviation [1]. A member learns its total, but slowly if both noises are alike;
+#: without other totals, the evidence lost meanwhile would count against its ratio.
 TOTAL_STD_FACTORS = (1 / 3, 1.0, 3.0)
 
 
@@ -47,10 +47,11 @@ class NoiseRatio:
     """Posterior of log(σ_w/σ_v), σ_w² = 1/γ and σ_v² = 1/ξ, over the hypotheses [1].
 
     Attributes:
-        mean: of the logarithm.
-        std: its standard deviation, with that within a step of the grid. Below 0.5 the ratio of the precisions is known
-            to a factor of 3; near ``prior_std`` the data does not tell. A truth beyond the grid it does not show.
-        prior_std: its standard deviation before the first sample.
+        mean: mean of the logarithm.
+        std: standard deviation of the logarithm, with a part for the step of the grid. Below 0.5 the ratio of the
+            precisions is known to a factor of 3; near ``prior_std`` the data has no information. A true ratio beyond
+            the grid goes unnoticed.
+        prior_std: standard deviation before the first sample.
     """
 
     mean: float
@@ -59,14 +60,14 @@ class NoiseRatio:
 
 
 def noise_grid(noises: FloatArray, grid_size: NoiseGridSize) -> FloatArray:
-    """(members, 4) shapes and rates of all hypotheses about those of one sensor.
+    """(members, 4) shapes and rates of γ and ξ of all hypotheses, for one sensor.
 
-    Of two numbers: so many values of σ_w and of σ_v, `GRID_FACTOR` from each other about those of ``noises``, in all
-    combinations: for noises of which each may be wrong by itself, by a factor of 9 for five values and of 27 for seven.
+    Two numbers are for noises that may each be wrong: the numbers of values of σ_w and of σ_v, a factor of
+    `GRID_FACTOR` apart about ``noises``, in all combinations. Five values reach a factor of 9, seven a factor of 27.
 
-    Of one number, for noises whose total is known about: their σ_w/σ_v is that of ``noises`` times 1/30 to 30 in equal
-    steps. Each ratio stands there three times: with √(σ_w² + σ_v²) as given, with a third of it, and with three times
-    it. The sum is what every member learns by itself, so the members of a level start equally near to it.
+    One number is for noises of roughly known total: the number of ratios σ_w/σ_v, from 1/30 to 30 times the ratio of
+    ``noises`` in equal logarithmic steps. Each ratio has three members, with √(σ_w² + σ_v²) as given, a third of it and
+    three times it.
     """
     if isinstance(grid_size, tuple):
         process, sensor = (GRID_FACTOR ** (2 * np.arange(count) - (count - 1.0)) for count in grid_size)
@@ -76,7 +77,7 @@ def noise_grid(noises: FloatArray, grid_size: NoiseGridSize) -> FloatArray:
 
 
 def member_priors(prior: Belief, grid_size: NoiseGridSize) -> FloatArray:
-    """(members, size) the records that the members begin with; the prior's own where there is one hypothesis."""
+    """(members, size) records of the members before the first sample; the prior itself for one hypothesis."""
     if grid_size == 1:
         return prior.record[None].copy()
     noises = noise_grid(prior.noises, grid_size)
@@ -89,10 +90,10 @@ def initial_weights(records: FloatArray, log_ratio_center: float | None = None) 
     """(M,) weights of members (M, size) before the first sample.
 
     Args:
-        records: that they begin with.
-        log_ratio_center: log(σ_w/σ_v) of noises that move the output and hide it alike: the weights are then half a Cauchy
-            density about that (`neg_log_half_cauchy`). They are even where it is None: that holds that either noise may as well
-            be next to 0, and where the samples cannot contradict, intervals become too narrow.
+        records: their records.
+        log_ratio_center: log(σ_w/σ_v) of noises with equal effect on the output: the weights are then a half-Cauchy
+            density about it (`neg_log_half_cauchy`). None is even weights: either noise may then be near 0, and
+            intervals become too narrow if the samples cannot contradict that.
     """
     if log_ratio_center is None:
         return np.full(len(records), 1 / len(records))
@@ -103,7 +104,7 @@ def initial_weights(records: FloatArray, log_ratio_center: float | None = None) 
 
 
 def neg_log_half_cauchy(log_deviation: FloatArray) -> FloatArray:
-    """Minus the logarithm of a density of log(σ_w/σ_v), ``log_deviation`` from its middle: half a Cauchy density of the ratio.
+    """Minus the log density of log(σ_w/σ_v) at ``log_deviation`` from its median, for a half-Cauchy ratio.
 
     (Gelman 2006, doi:10.1214/06-BA117A.) Up to a constant.
     """
@@ -111,7 +112,7 @@ def neg_log_half_cauchy(log_deviation: FloatArray) -> FloatArray:
 
 
 def mixture_record(records: FloatArray, n_quantities: int, weights: FloatArray) -> FloatArray:
-    """(size,) the record of the mixture of members (M, size) with weights (M,), of so many states and coefficients."""
+    """(size,) record of the mixture of members (M, size) with weights (M,), for ``n_quantities`` means."""
     record: FloatArray = compile_mixture(n_quantities).mixture(pack_into_lanes(records, LANES), weights)[1]
     return record
 
@@ -124,7 +125,7 @@ def pack_into_lanes(records: FloatArray, lanes: int) -> FloatArray:
 
 
 def scale_noises(noises: FloatArray, ratio_factor: float, total_std_factor: float) -> FloatArray:
-    """Shapes and rates (4,) with σ_w/σ_v multiplied by ``ratio_factor``, σ_w² + σ_v² by ``total_std_factor``², and the shapes kept."""
+    """(4,) shapes and rates with σ_w/σ_v scaled by ``ratio_factor`` and σ_w² + σ_v² by ``total_std_factor``²."""
     q, r = noises[1] / noises[0], noises[3] / noises[2]
     ratio, total = ratio_factor**2 * q / r, total_std_factor**2 * (q + r)
     scaled = noises.copy()
@@ -141,12 +142,12 @@ def log_noise_ratio(noises: FloatArray) -> float:
 def noise_ratio_posterior(
     weights: FloatArray, log_ratios: FloatArray, prior_log_ratios: FloatArray, prior_weights: FloatArray
 ) -> NoiseRatio:
-    """What weights (M,) of members with these log ratios (M,) say.
+    """Posterior of the noise ratio from weighed members.
 
     Args:
-        weights: of members.
-        log_ratios: of these.
-        prior_log_ratios: (members,) the log ratios that all members began with.
+        weights: (M,) weights of members.
+        log_ratios: (M,) their log(σ_w/σ_v).
+        prior_log_ratios: (members,) log ratios of all members before the first sample.
         prior_weights: (members,) their weights then.
     """
     mean = weights @ log_ratios
@@ -157,10 +158,10 @@ def noise_ratio_posterior(
 
 
 def moment_matched_gamma(weights: FloatArray, shapes: FloatArray, rates: FloatArray) -> tuple[float, float]:
-    """Shape and rate of a Gamma density for a mixture of them, by mean and variance of the noise's variance.
+    """Shape and rate of a Gamma density that matches a mixture in mean and variance of the noise variance.
 
-    That of a density is taken as 1/E[g], as it acts in an update, with the relative variance 1/shape
-    (`estimator.engine.mixture_moments` does so in compiled code).
+    A density has the noise variance 1/E[g], as in an update, with relative variance 1/shape; the compiled version is
+    `estimator.engine.mixture_moments`.
     """
     variances = rates / shapes
     mean = weights @ variances

@@ -1,7 +1,7 @@
-"""Mixtures of hypotheses about the noises (`estimator.inference.noise_grid`), compiled: their weights, and their moments.
+"""Weights, forecasts and moments of mixtures of noise hypotheses (`estimator.inference.noise_grid`), compiled.
 
-Everything here is of n systems at once, so that the compiler may work on several at a time. Of one system, each sum
-over the members goes from the first to the last, so that a system comes out the same however many there are.
+The functions take n systems at once, for SIMD. Every sum over the members of a system runs from the first to the last,
+so the result does not depend on n.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from estimator.compilation.elementary_functions import exp, log
 from estimator.compilation.simd import LANES, jit, jit_closure, kernel
 from estimator.engine.mixture_moments import N_NOISES, compile_mixture_moments
 
-#: Probability per sample that the hypothesis is drawn anew: no weight stays below it for good.
+#: Probability per sample that the true hypothesis is drawn anew [1]; it bounds the weights from below.
 SWITCHING_PROBABILITY = 1e-6
 
 
 @jit
 def apply_switching(weights, member_energies):
-    """Let the hypothesis be drawn anew, and leave out the members that are no longer finite.
+    """Mix the weights with even ones, and drop the members that are not finite.
 
     Args:
-        weights: (M, n) of the members; overwritten. NaN where none is left.
-        member_energies: (M, n) their free energies of the next sample.
+        weights: (M, n) of the members; overwritten. NaN if no member is left.
+        member_energies: (M, n) free energies of the sample [nats].
     """
     members, n = weights.shape
     total = np.zeros(n)
@@ -42,12 +42,12 @@ def apply_switching(weights, member_energies):
 
 @jit
 def reweight(weights, member_energies, mixture_energies):
-    """Weigh the members by their free energies of a sample.
+    """Update the weights by the free energies of a sample.
 
     Args:
-        weights: (M, n) before it, as `apply_switching` leaves them; overwritten with those after it.
-        member_energies: (M, n) free energies of the members [nats]; of no effect where there is no weight.
-        mixture_energies: (n,) receives those of the mixtures; not finite where no member is left.
+        weights: (M, n) after `apply_switching`; overwritten with the weights after the sample.
+        member_energies: (M, n) free energies of the members [nats]; ignored without weight.
+        mixture_energies: (n,) receives the free energies of the mixtures; not finite if no member is left.
     """
     members, n = weights.shape
     evidence = np.zeros(n)
@@ -73,7 +73,7 @@ def reweight(weights, member_energies, mixture_energies):
 
 @jit
 def mark_diverged(member_energies, predictions):
-    """Make all free energies (iterations,) of a member NaN where one is not finite, or a prediction (sensors, 2)."""
+    """Set a member's free energies (iterations,) to NaN if one, or a prediction (sensors, 2), is not finite."""
     total = 0.0
     for k in range(len(predictions)):
         total += predictions[k, 0] + predictions[k, 1]
@@ -88,11 +88,11 @@ def forecast_mixture(weights, predictions, forecasts):
     """Mean and variance of the mixture of one system's predictions.
 
     Args:
-        weights: (M, n), of which the first column counts, as `apply_switching` leaves it.
+        weights: (M, n) after `apply_switching`; the first column counts.
         predictions: (M, sensors, 2) means and variances of the members.
-        forecasts: (sensors, 2) receives those of the mixture; NaN where no member is left.
+        forecasts: (sensors, 2) receives mean and variance of the mixture; NaN if no member is left.
     """
-    initial = 0.0 * weights[0, 0]  # NaN where no member is left
+    initial = 0.0 * weights[0, 0]  # NaN if no member is left
     for k in range(len(forecasts)):
         mean, variance = initial, initial
         for m in range(len(weights)):
@@ -109,14 +109,14 @@ class MixtureMoments(NamedTuple):
 
     Attributes:
         mix: ``mix(blocks, first, weights, shares, records, stride)`` writes the records of beliefs with the moments of
-            n mixtures (`estimator.engine.mixture_moments`); all NaN where no member is finite.
+            n mixtures (`estimator.engine.mixture_moments`); all NaN if no member is finite.
 
-            - ``blocks`` (blocks, rows * LANES): member m of system j stands in lane m n + j, counted from block
-              ``first`` on, with the numbers of its record in the first rows; n divides `LANES`;
+            - ``blocks`` (blocks, rows * LANES): member m of system j is in lane m n + j, counted from block ``first``
+              on, with its record in the first rows; n divides `LANES`;
             - ``weights`` (M, n) of the members;
-            - ``shares`` (M n,) receives those of the members whose numbers are finite, which sum to 1 for a system;
+            - ``shares`` (M n,) receives the weights of the finite members, normalised for each system;
             - ``records``: flat array that receives number i of system j at ``i * stride + j``.
-        mixture: ``mixture(blocks, weights)``, of one system with weights (M,): the shares (M,), and the record.
+        mixture: ``mixture(blocks, weights)`` for one system with weights (M,): the shares (M,), and the record.
     """
 
     mix: Any
@@ -125,19 +125,14 @@ class MixtureMoments(NamedTuple):
 
 @cache
 def compile_mixture(n_quantities: int) -> MixtureMoments:
-    """The moments of beliefs in so many states and coefficients, of one sensor."""
-    compiled_moments, jit_variant = compile_mixture_moments(n_quantities), jit_closure(str(n_quantities))
-    check, means, spreads, tails = (
-        compiled_moments.check,
-        compiled_moments.means,
-        compiled_moments.spreads,
-        compiled_moments.tails,
-    )
+    """Compile the moments of mixtures of beliefs in ``n_quantities`` states and coefficients, of one sensor."""
+    check, means, spreads, tails = compile_mixture_moments(n_quantities)
+    jit_variant = jit_closure(str(n_quantities))
     size = n_quantities + n_quantities * (n_quantities + 1) // 2 + 2 * N_NOISES
 
     @jit_variant
     def share_out(blocks, first, weights, shares, likeliest):
-        """Share out the weight among the members that are finite, and note who is the likeliest (n,)."""
+        """Normalise the weights of the finite members, and find the likeliest member (n,)."""
         members, n = weights.shape
         total, most = np.zeros(n), np.zeros(n)
         for m in range(members):

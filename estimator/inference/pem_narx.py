@@ -1,11 +1,11 @@
-"""`PEMNARX`: the paper's offline baseline, a sigmoid network fitted to a whole record by prediction-error minimisation.
+"""`PEMNARX`, the paper's offline baseline: a sigmoid NARX network fitted by prediction-error minimisation.
 
-The network is that of MATLAB's ``idnlarx`` with a ``sigmoidnet`` of K units,
+The network is MATLAB's ``idnlarx`` with a ``sigmoidnet`` of K units,
 
     f(r) = (r - r0)' L + d + sum_k a_k σ((r - r0)' b_k + c_k),    σ(s) = 1 / (1 + exp(-s)),
 
-with the regressors r = (y_{t-1}, y_{t-2}, u_{t-delay}) and their mean r0. MATLAB's projections P and Q only rotate and
-scale the regressors where there are as many columns as regressors, so they are part of L and b_k here.
+with the regressors r = (y_{t-1}, y_{t-2}, u_{t-delay}) and their mean r0. MATLAB's square projections P and Q only
+rotate and scale the regressors, so they are part of L and b_k here.
 
 The 4 + 5K parameters lie in one vector, in the order L (3), d, a (K), c (K), b (3K, a row per regressor).
 """
@@ -22,15 +22,15 @@ from estimator.compilation.simd import kernel
 from estimator.support.argument_checks import check_integer, to_finite_series
 from estimator.support.array_types import FloatArray
 
+#: Relative decrease of the cost at which a fit has converged [1]. A tolerance ten times smaller changes the training
+#: error on the Silverbox record by less than 0.02 %, and the gain over a linear model there is 0.8 %.
 COST_TOLERANCE = 1e-6
-"""A fit has converged where a step lowers the cost by less than this fraction. On the Silverbox record the whole gain
-over a linear model is 0.8 %, and a tolerance ten times smaller changes the training error by less than 0.02 %."""
 
+#: Upper limit of the evaluations of the network over the record, per restart.
 MAX_EVALUATIONS = 200
-"""Evaluations of the network over the whole record after which a restart ends, converged or not."""
 
+#: Output beyond which a free run counts as diverged [V].
 DIVERGED_OUTPUT = 1e6
-"""Output of a free run [V] from which on it counts as diverged."""
 
 
 @dataclass(eq=False)
@@ -38,10 +38,10 @@ class PEMNARX:
     """Nonlinear autoregression y_t = f(y_{t-1}, y_{t-2}, u_{t-delay}), fitted offline by prediction-error minimisation.
 
     `fit` minimises the mean squared one-step prediction error with Levenberg-Marquardt (MINPACK) and the analytic
-    Jacobian, on regressors and outputs of zero mean and unit variance. Every restart begins at the least-squares linear
-    model, with silent units (a = 0) of random direction and bias; the one with the lowest training error is kept.
+    Jacobian, on standardised regressors and outputs. Every restart begins at the least-squares linear model, with
+    silent units (a = 0) of random direction and bias; the fit with the lowest training error is kept.
 
-    It is better than the published row, whose network is no minimum of the criterion (docs/reproduction.md).
+    The fit is better than the published one, which is no minimum of the criterion (docs/reproduction.md).
 
     Args:
         units: number K >= 0 of sigmoid units; with 0 the model is a linear ARX model with an offset.
@@ -84,7 +84,7 @@ class PEMNARX:
         check_integer("input_delay (the published run had 0)", self.input_delay, 1, 0)
 
     def fit(self, u: npt.ArrayLike, y: npt.ArrayLike) -> PEMNARX:
-        """Fits the network to one record, and gives this model. An earlier fit is replaced.
+        """Fit the network to one record, and return this model. An earlier fit is replaced.
 
         Args:
             u: (T,) inputs [V].
@@ -152,16 +152,15 @@ class PEMNARX:
     def simulate(self, u: npt.ArrayLike, y_init: npt.ArrayLike) -> FloatArray:
         """Free run over all of u: each output from the two simulated before it.
 
-        The units are bounded, so a free run diverges only if the linear part is unstable. It then counts as diverged
-        from the first output beyond 1e6 V on, and everything from there is NaN: errors computed from it are NaN too,
-        neither an overflow nor a number that looks like a result.
+        The units are bounded, so a free run diverges only if the linear part is unstable. From the first output beyond
+        1e6 V on, all outputs are NaN, and so are errors computed from them.
 
         Args:
             u: (T,) inputs [V].
-            y_init: The first outputs, which are given and start the run; between 2 and T of them [V].
+            y_init: between 2 and T first outputs, from which the run starts [V].
 
         Returns:
-            Simulated outputs (T,) [V], beginning with y_init; NaN from where the model diverges.
+            (T,) simulated outputs [V], beginning with y_init; NaN after the model diverges.
 
         Raises:
             ValueError: If u or y_init is not a finite series, or y_init has fewer than 2 or more than T entries.
@@ -224,7 +223,7 @@ def _split_parameters(parameters: FloatArray) -> tuple[FloatArray, np.float64, F
 
 
 def _in_volts(parameters: FloatArray, scale: FloatArray, target_mean: float, target_scale: float) -> FloatArray:
-    """The network of centred regressors and outputs in volts, from that of the standardised ones."""
+    """Parameters for regressors and outputs in volts, from the parameters for standardised ones."""
     linear, offset, amplitude, bias, direction = _split_parameters(parameters)
     return np.concatenate(
         [
@@ -239,7 +238,7 @@ def _in_volts(parameters: FloatArray, scale: FloatArray, target_mean: float, tar
 
 @kernel(fastmath=False)
 def _free_run(parameters, regressor_mean, u, input_delay, y, start):
-    """Continues y in place from sample ``start`` on."""
+    """Continue y in place from sample ``start`` on."""
     units = (len(parameters) - 4) // 5
     amplitude, bias = parameters[4 : 4 + units], parameters[4 + units : 4 + 2 * units]
     direction = parameters[4 + 2 * units :].reshape(3, units)
@@ -258,7 +257,7 @@ def _free_run(parameters, regressor_mean, u, input_delay, y, start):
 
 
 def _checked_pair(u: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two finite series of one length of at least 2."""
+    """Two finite series of equal length of at least 2."""
     inputs, outputs = to_finite_series("u", u), to_finite_series("y", y)
     if inputs.shape != outputs.shape or len(outputs) < 2:
         raise ValueError(

@@ -21,13 +21,13 @@ from estimator.support.array_types import FloatArray
 
 
 class FilteredRecords(NamedTuple):
-    """What `filter_records` adds up over n series.
+    """Totals of `filter_records` over n series.
 
     Attributes:
-        loss: (n,) minus the log likelihood, up to a constant; zeros where no outputs are followed.
-        gradient: (n, K) its slope by the coefficients, likewise.
-        information: (n, K, K).
-        innovations_squared: (n,) Σ ν²/S, which is near the number of outputs where the noises are right.
+        loss: (n,) minus the log likelihood, up to a constant; zeros without outputs.
+        gradient: (n, K) its gradient by the coefficients, likewise.
+        information: (n, K, K) Fisher information.
+        innovations_squared: (n,) Σ ν²/S, near the number of outputs if the noise variances are right.
     """
 
     loss: FloatArray
@@ -37,14 +37,14 @@ class FilteredRecords(NamedTuple):
 
 
 def inputs_by_sample(model: Model, u: FloatArray, degree: int = 0) -> FloatArray:
-    """(n, T, rows) what a model takes over each sample, of inputs (n, T) before which there were none.
+    """(n, T, rows) input of each sample, from inputs (n, T) that are 0 before the first.
 
-    The taps of a difference equation, newest first; or the polynomial of degree 0 (held) or 1 (from the input before).
+    Rows are the taps of a difference equation, newest first, or the polynomial of degree 0 (held) or 1 (linear).
     """
     before = [np.concatenate([np.zeros((len(u), lag)), u[:, : u.shape[1] - lag]], axis=1) for lag in range(3)]
     if model.is_continuous and degree == 1:
         return np.stack([before[1] + 0.0 * u, u - before[1]], axis=2)
-    return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # not a number beyond the end
+    return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # NaN beyond the end
 
 
 def filter_records(
@@ -58,18 +58,18 @@ def filter_records(
     sample_lengths: FloatArray | None = None,
     forecasts: FloatArray | None = None,
 ) -> FilteredRecords:
-    """Run the filter over n series.
+    """Run the linearised Kalman filter over n series.
 
     Args:
         model: the equation.
         coefficients: (n, K) coefficients.
         inputs: (n, T, rows) inputs of each sample (`inputs_by_sample`); a series ends before its first NaN.
-        y: (n, T, p) outputs, NaN where one is missing; None for the response without noise.
-        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor's.
-        initial_state_cov: (n_states, n_states) of the states at the start.
-        initial_state: (n, n_states) of the states at the start; at rest where it is 0.
-        sample_lengths: (n, T) length of each sample of a differential equation, in sampling steps; all 1 where it is None.
-        forecasts: (n, T, p, 2), to be filled with mean and variance of each output before it was seen.
+        y: (n, T, p) outputs, NaN where one is missing; None for the noise-free response.
+        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor.
+        initial_state_cov: (n_states, n_states) covariance of the states at the start.
+        initial_state: (n, n_states) mean of the states at the start; 0 is at rest.
+        sample_lengths: (n, T) length of each sample of a differential equation, in sampling steps; None for all 1.
+        forecasts: (n, T, p, 2) receives the predictive mean and variance of each output.
     """
     k = model.n_coefficients
     lengths = record_lengths(inputs[:, :, 0])
@@ -96,17 +96,30 @@ def filter_records(
 #: (rows, columns) of the upper triangle of a square matrix.
 _upper_triangle = cache(np.triu_indices)
 
-#: Variance of what a missing output would have shown, in parts of a sensor's.
+#: Factor on the sensor's variance for a missing output [1].
 _MISSING_VARIANCE_FACTOR = 1e18
 
-#: Series that run side by side: one vector of the widest kind, because a fit has few.
+#: Series side by side: one AVX-512 vector, since a fit has few series.
 _FIT_LANES = 8
 
 
 class _RowOffsets(NamedTuple):
-    """How many moments of the state, coefficients, sensors and totals a loop has, and the first row of what it needs.
+    """Sizes of the loop's quantities, and their first rows in the block; -1 for a row that is not there.
 
-    Where it has no such row, it is -1.
+    Attributes:
+        n_state_moments: means and covariances of the states.
+        n_coefficients: coefficients.
+        n_outputs: sensors.
+        n_totals: rows of `FilteredRecords`.
+        coefficient: first coefficient.
+        noise: variance of the process noise; the sensors' follow.
+        input: first row of the input.
+        sample_length: length of the sample.
+        is_counted: whether the sample counts.
+        first_total: first of the totals.
+        output: first output.
+        predicted_output: first predicted output.
+        predicted_variance: its variance without sensor noise.
     """
 
     n_state_moments: int
@@ -124,12 +137,12 @@ class _RowOffsets(NamedTuple):
     predicted_variance: int
 
 
-# What does not depend on the model is compiled for all models at once, which takes as long as for one.
+# The next functions do not depend on the model, and are compiled once for all models.
 
 
 @jit
 def _load_records(W, at, first, lanes, coefficients, lengths, initial_moments, noises):
-    """Lay the series from ``first`` on side by side; gives the length of the longest."""
+    """Load the series from ``first`` on side by side; returns the length of the longest."""
     W[:] = 0.0
     longest = 0
     for j in range(_FIT_LANES):
@@ -147,7 +160,7 @@ def _load_records(W, at, first, lanes, coefficients, lengths, initial_moments, n
 
 @jit
 def _load_sample(W, at, first, lanes, t, inputs, y, sample_lengths, lengths, noises):
-    """Lay out the next sample of each."""
+    """Load sample t of each series."""
     for j in range(_FIT_LANES):
         i = first + min(j, lanes - 1)
         is_active = t < lengths[i]
@@ -169,7 +182,7 @@ def _load_sample(W, at, first, lanes, t, inputs, y, sample_lengths, lengths, noi
 
 @jit
 def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
-    """Take what the sample gave: forecasts, and the totals of those whose last one it was."""
+    """Store the forecasts of sample t, and the totals of series that end with it."""
     for j in range(lanes):
         if at.output >= 0 and len(forecasts) and t < lengths[first + j]:
             for c in range(at.n_outputs):
@@ -180,13 +193,13 @@ def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
         if t + 1 == lengths[first + j]:
             for c in range(at.n_totals):
                 totals[first + j, c] = W[(at.first_total + c) * _FIT_LANES + j]
-            for c in range(at.first_total):  # it is over, and goes on at rest
+            for c in range(at.first_total):  # a finished series goes on at rest
                 W[c * _FIT_LANES + j] = 0.0
 
 
 @cache
 def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
-    """The compiled loop of `filter_records`, with totals (n, 2 + K + K (K + 1)/2) packed."""
+    """Compile the loop of `filter_records`, with totals (n, 2 + K + K (K + 1)/2) packed."""
     linearised_filter = compile_linearised_filter(
         model, degree, follows_outputs=follows_outputs, lanes=_FIT_LANES, variable_step=variable_step
     )
@@ -222,10 +235,10 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
 
 
 def noise_variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt.ArrayLike) -> FloatArray:
-    """(1 + p,) of the process noise, and of each sensor's, from standard deviations; (n, 1 + p) of a batch.
+    """(1 + p,) variances of the process noise and of each sensor, from standard deviations; (n, 1 + p) of a batch.
 
     Raises:
-        ValueError: for one that is out of range, or a number of sensors that is not the model's.
+        ValueError: for a value out of range, or another number of sensors than the model has.
     """
     process = to_float_array("process_noise", process_noise)
     if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
@@ -247,14 +260,14 @@ def noise_variances(model: Model, process_noise: npt.ArrayLike, measurement_nois
     except ValueError:
         sizes = process.shape, stds.shape[:-1]
         raise ValueError(
-            f"process_noise and measurement_noise must be of as many records, but are of {sizes}"
+            f"process_noise and measurement_noise must be batches of one size, but have {sizes}; repeat the smaller"
         ) from None
     sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
     return np.concatenate([np.broadcast_to(process, shape)[..., None], sensors], axis=-1) ** 2
 
 
 def outputs_by_sensor(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:
-    """Outputs (..., T, p) that go with inputs (..., T); the last axis may be left out for one sensor.
+    """Outputs (..., T, p) paired with inputs (..., T); one sensor may omit the last axis.
 
     Raises:
         ValueError: for another shape.
@@ -265,6 +278,6 @@ def outputs_by_sensor(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> Flo
     if outputs.shape != (*inputs.shape, model.n_outputs):
         raise ValueError(
             f"u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have "
-            f"{inputs.shape} and {outputs.shape}"
+            f"{inputs.shape} and {outputs.shape}; transpose or cut one"
         )
     return outputs

@@ -61,12 +61,12 @@ def test_several_sensors(records):
 @table(
     ("call", "message"),
     [
-        (lambda u: posteriors(u[0], u[0], silverbox_prior()), "u and y must have one shape (n, T), but have (40,)"),
+        (lambda u: posteriors(u[0], u[0], silverbox_prior()), "u must have shape (n, T), but has (40,)"),
         (
             lambda u: posteriors(u, u[:, :-1], silverbox_prior()),
-            "u and y must have one shape (n, T), but have (35, 40)",
+            "u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have (35, 40)",
         ),
-        (lambda u: posteriors(u, u * np.nan, silverbox_prior()), "but those of record 0 are not"),
+        (lambda u: posteriors(u, u * np.nan, silverbox_prior()), "but in record 0 they are not"),
         (lambda u: posteriors(np.ma.masked_array(u), u, silverbox_prior()), "u must not be a masked array"),
         (lambda u: posteriors(u, u + 1j, silverbox_prior()), "y must be numbers"),
         (lambda u: posteriors(u, u, 3), "prior must be a Belief, but is 3"),

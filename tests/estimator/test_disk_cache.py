@@ -97,7 +97,7 @@ def test_damaged_code_is_made_anew_with_one_warning(place, damage):
     (path,) = place.iterdir()
     whole = path.read_bytes()
     path.write_bytes(damage(whole))
-    with pytest.warns(RuntimeWarning, match=f"compiled code in {place} is damaged, and is made anew") as caught:
+    with pytest.warns(RuntimeWarning, match=f"compiled code in {place} is damaged, and is compiled anew") as caught:
         results = [called(), called(), (path.write_bytes(damage(whole)), called())[1]]
     assert results == [(42, 0), (42, 1), (42, 0)]
     assert len(caught) == 1

@@ -155,9 +155,9 @@ def test_errors_name_the_argument(arguments, words):
 def test_errors_of_batches_and_of_nothing_learned():
     with pytest.raises(ValueError, match="batches of one size"):
         fisher_information(PAPER, np.ones((3, 4)), np.zeros((2, 5)), Q, R)
-    with pytest.raises(ValueError, match="process_noise and measurement_noise must be of as many records"):
+    with pytest.raises(ValueError, match="process_noise and measurement_noise must be batches"):
         fisher_information(PAPER, TWIN, np.zeros(5), np.full(3, Q), np.full((2, 1), R))
-    with pytest.raises(ValueError, match="coefficients must be of"):
+    with pytest.raises(ValueError, match=r"coefficients must be .* on the last axis"):
         fisher_information(PAPER, np.ones(3), np.zeros(5), Q, R)
     with pytest.raises(ValueError, match="positive definite"):
         cramer_rao(fisher_information(PAPER, TWIN, np.zeros(5), Q, R))

@@ -97,7 +97,7 @@ def test_what_does_not_fit_is_refused():
         maximum_a_posteriori(PAPER, np.zeros((2, 3)), np.zeros((2, 4)), PRIOR, *NOISES)
     with pytest.raises(ValueError, match="process_noise must be 0 or more"):
         maximum_a_posteriori(PAPER, np.zeros((2, 3)), np.zeros((2, 3)), PRIOR, -1.0, 1e-4)
-    with pytest.raises(ValueError, match="prior must be of"):
+    with pytest.raises(ValueError, match="prior must have the coefficients"):
         maximum_a_posteriori(PENDULUM, np.zeros((2, 3)), np.zeros((2, 3, 2)), PRIOR, 1e-3, 1e-3)
     zeros = np.zeros((2, 3))
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Straight functions: each construct does what Python does with it, and what is not straight is refused."""
+"""Functions of `scalar_jit`: each construct computes the same as in Python, and all others are refused."""
 
 import math
 import re
@@ -290,18 +290,18 @@ def test_turns_of_short_loops_go_side_by_side(lines, turns):
         (keeps, (np.zeros(4), 1.0), "'range(4)' in keeps keeps ['a'], which must go into a block; compile it with jit"),
         (repeats, (4.0,), "cannot stand in a scalar_jit function; compile it with jit instead"),
         (calls, (4.0,), "'math.gamma(a)' in calls calls a function that scalar_jit cannot compile"),
-        (indexes, (np.zeros(4), 1.0), "a whole number is needed in indexes, and not a float"),
+        (indexes, (np.zeros(4), 1.0), "indexes needs an integer, but has a float"),
         (forgets, (1.0,), "name 'nothing_of_this_name' is not defined in forgets"),
-        (powers, (1.0, 2.0), "Pow of floats stands in powers"),
+        (powers, (1.0, 2.0), "powers has Pow of floats"),
         (chains, (1.0,), "'b = c = a' in chains cannot stand in a scalar_jit function"),
         (names_arguments, (1.0,), "in names_arguments gives arguments by name"),
         (returns_within, (np.zeros(4),), "'range(4)' in returns_within is no plain loop over range(n)"),
         (never_turns, (np.zeros(4),), "'range(0)' in never_turns must have a turn"),
         (starts_elsewhere, (np.zeros(4),), "'range(1, 4)' in starts_elsewhere is no plain loop over range(n)"),
         (remembers, (np.zeros(4),), "name 'b' is not defined in remembers; assign it before, and not in a loop"),
-        (loses, (np.zeros(4),), "loses calls total, which returns something; let it write into a block"),
+        (loses, (np.zeros(4),), "loses calls total, which has a block and a result; write the result into a block"),
         (counts_back, (np.zeros(4),), "'W[-1]' in counts_back counts from the end"),
-        (inverts, (1,), "inverts changes the sign of something that is not a number"),
+        (inverts, (1,), "inverts negates a value that is not a number"),
         (is_none, (1.0,), "is_none compares by Is; use < <= > >= == or !="),
         (asks, (np.zeros(4),), "'W.size' in asks asks a number or a block for an attribute"),
         (gives_too_much, (1.0,), "swapped takes ['pair', 'more'], but is given 3 arguments; give all"),

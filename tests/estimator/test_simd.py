@@ -42,8 +42,8 @@ def test_rows_are_numbered_in_order():
     assert number_rows("a b", " c\n d", first_row=3) == {"a": 3, "b": 4, "c": 5, "d": 6}
 
 
-def test_rows_refuse_a_name_that_stands_there_twice():
-    with pytest.raises(ValueError, match=re.escape("every row once, but ['b'] stand there twice; rename")):
+def test_rows_refuse_a_repeated_name():
+    with pytest.raises(ValueError, match=re.escape("every row once, but ['b'] twice; rename them; rename")):
         number_rows("a b", "c b")
 
 
@@ -187,7 +187,8 @@ def test_functions_within_functions_are_named_apart():
                 unnamed.extend(f"{name}: {child.name}" for decorator in names if decorator in ("jit", "kernel"))
             look(child, within or is_function, name)
 
-    for path in [p for package in ("estimator", "duffing_env", "agents", "research") for p in (root / package).rglob("*.py")]:
+    packages = ("estimator", "duffing_env", "agents", "research")
+    for path in [path for package in packages for path in (root / package).rglob("*.py")]:
         if path.parent.name == "__pycache__":  # generated
             continue
         look(ast.parse(path.read_text(encoding="utf-8")), False, path.name)

@@ -11,18 +11,18 @@ from typing import Any
 
 
 class FunctionSource:
-    """A function's definition, and what its names stand for.
+    """A function's definition, and the objects of its names.
 
     Args:
-        function: as Python defined it.
-        text: that was executed to define it; None where its file holds it.
+        function: the Python function.
+        text: its source; None to read the file.
     """
 
     def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
         self.function = function
         self.name = function.__qualname__
         if text is None:
-            # The text as it is now, and not when it is compiled: the file may have changed then.
+            # The text is read now: the file may change before compilation.
             linecache.checkcache(function.__code__.co_filename)
             text = "".join(linecache.getlines(function.__code__.co_filename))
         self._text = text
@@ -32,7 +32,7 @@ class FunctionSource:
         """The definition.
 
         Raises:
-            TypeError: where the function's file does not hold it.
+            TypeError: if the function's file does not have it.
         """
         code = self.function.__code__
         tree = _functions_by_line(self._text).get(code.co_firstlineno)
@@ -46,10 +46,10 @@ class FunctionSource:
         return list(self.function.__code__.co_varnames[: self.function.__code__.co_argcount])
 
     def resolve(self, name: str) -> Any:
-        """What a name that is not local stands for.
+        """The object of a name that is not local.
 
         Raises:
-            NameError: for one that stands for nothing, or for what a loop has assigned and forgotten.
+            NameError: for an undefined name, or one that is assigned in a loop only.
         """
         free = self.function.__code__.co_freevars
         if name in free:
@@ -63,7 +63,7 @@ class FunctionSource:
 
 @cache
 def _functions_by_line(text: str) -> Mapping[int, ast.FunctionDef]:
-    """The definitions in a file's text, by their first lines."""
+    """The definitions in a file's text, by first line."""
     nodes = ast.walk(ast.parse(text))
     found = [node for node in nodes if isinstance(node, ast.FunctionDef)]
     return {min([node.lineno, *(d.lineno for d in node.decorator_list)]): node for node in found}

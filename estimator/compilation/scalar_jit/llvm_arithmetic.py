@@ -1,4 +1,4 @@
-"""Arithmetic in the text of LLVM."""
+"""Arithmetic and comparisons as LLVM text, for `scalar_jit`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-#: A multiplication and an addition may be fused into one operation; nothing else may be reordered.
+#: LLVM flag: a multiplication and an addition may be fused, without any other reordering.
 FMA_FLAG = "contract"
 
 LLVM_TYPES = {"double": "double", "i1": "i1", "i64": "i64", "word": "i64", "ptr": "ptr"}
@@ -24,10 +24,11 @@ _INTEGER_OPERATIONS: dict[type[ast.operator], str] = {
 
 
 class Scalar(NamedTuple):
-    """A value in LLVM: its kind and its name, or a number as text.
+    """A value in LLVM.
 
-    Kinds are ``double``, ``i1`` (a truth), ``i64``, ``word`` (64 bits without a sign, which LLVM does not tell from an
-    i64) and ``ptr`` (a block).
+    Attributes:
+        llvm_type: ``double``, ``i1`` (a boolean), ``i64``, ``word`` (an unsigned i64) or ``ptr`` (a block).
+        text: name of the value, or a number.
     """
 
     llvm_type: str
@@ -35,12 +36,12 @@ class Scalar(NamedTuple):
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a number of Python or NumPy, known while the text is written."""
+    """Whether a value is a number of Python or NumPy, known at translation."""
     return isinstance(value, bool | int | float | np.generic)
 
 
 def is_float(value: Any) -> bool:
-    """Whether a value is a number that need not be whole."""
+    """Whether a value is a floating-point number."""
     return isinstance(value, float | np.floating)
 
 
@@ -50,10 +51,10 @@ def is_tuple(value: Any) -> bool:
 
 
 class LlvmArithmetic:
-    """Lines of a function, and the operations that write them. A value is a `Scalar`, or a number.
+    """Lines of a function, and the operations that write them. A value is a `Scalar` or a number.
 
     Args:
-        name: of the function, for messages.
+        name: name of the function, for messages.
     """
 
     def __init__(self, name: str) -> None:
@@ -62,7 +63,7 @@ class LlvmArithmetic:
         self.count = 0
 
     def emit(self, result_type: str, text: str) -> Scalar:
-        """Write a line that makes a value."""
+        """Write a line that defines a value."""
         self.count += 1
         self.lines.append(f"%v{self.count} = {text}")
         return Scalar(result_type, f"%v{self.count}")
@@ -72,9 +73,7 @@ class LlvmArithmetic:
         if isinstance(operator, ast.Not):
             return self.emit("i1", f"xor i1 {self.truth(value)}, true")
         if not isinstance(operator, ast.USub) or (isinstance(value, Scalar) and value.llvm_type in ("i1", "ptr")):
-            raise TypeError(
-                f"{self.name} changes the sign of something that is not a number; negate numbers with a minus"
-            )
+            raise TypeError(f"{self.name} negates a value that is not a number; apply a minus to numbers only")
         if is_number(value):
             return -value
         if value.llvm_type == "double":
@@ -96,7 +95,7 @@ class LlvmArithmetic:
             return self.emit("i1", f"{_INTEGER_OPERATIONS[operation]} i1 {a.text}, {b.text}")
         if operation is ast.Div or "double" in operand_types:
             if operation not in _FLOAT_OPERATIONS:
-                raise TypeError(f"{operation.__name__} of floats stands in {self.name}")
+                raise TypeError(f"{self.name} has {operation.__name__} of floats; compile it with jit instead")
             return self.emit(
                 "double", f"{_FLOAT_OPERATIONS[operation]} {FMA_FLAG} double {self.double(a)}, {self.double(b)}"
             )
@@ -111,7 +110,7 @@ class LlvmArithmetic:
         return self.emit(result_type, f"{name} i64 {self.integer(a)}, {self.integer(b)}")
 
     def compare(self, comparison: type[ast.cmpop], a: Any, b: Any) -> Scalar:
-        """The truth of a comparison, which does not hold with NaN but for ``!=``."""
+        """A comparison; with NaN it is false, except ``!=``."""
         if comparison not in _COMPARISONS:
             raise TypeError(f"{self.name} compares by {comparison.__name__}; use < <= > >= == or !=")
         predicate = _COMPARISONS[comparison]
@@ -123,7 +122,7 @@ class LlvmArithmetic:
         return self.emit("i1", f"fcmp {FMA_FLAG} {nan_prefix}{predicate} double {self.double(a)}, {self.double(b)}")
 
     def select(self, condition: str, a: Any, b: Any) -> Scalar:
-        """The first of two values where something is true, else the second."""
+        """The first value if the condition is true, else the second."""
         a, b = (self.scalar(x) if is_number(x) else x for x in (a, b))
         if is_tuple(a) or is_tuple(b):
             raise TypeError(f"{self.name} chooses between tuples; choose between their parts")
@@ -135,7 +134,7 @@ class LlvmArithmetic:
         return self.emit("double", f"select i1 {condition}, double {self.double(a)}, double {self.double(b)}")
 
     def truth(self, value: Any) -> str:
-        """A value as a truth."""
+        """A value as a boolean."""
         if is_number(value):
             return "true" if value else "false"
         if value.llvm_type == "double":
@@ -143,7 +142,7 @@ class LlvmArithmetic:
         return str(value.text) if value.llvm_type == "i1" else self.emit("i1", f"icmp ne i64 {value.text}, 0").text
 
     def convert(self, to_type: str, value: Any) -> Scalar:
-        """A value as a number of another kind."""
+        """A value converted to another type."""
         if to_type == "double":
             return Scalar(to_type, self.double(value))
         if is_number(value) or value.llvm_type != "double":
@@ -160,15 +159,15 @@ class LlvmArithmetic:
         return self.emit("double", f"{conversion} {value.text} to double").text
 
     def integer(self, value: Any) -> str:
-        """A value as a whole number."""
+        """A value as an integer."""
         if is_number(value) and not is_float(value):
             return str(int(value))
         if is_number(value) or value.llvm_type == "double":
-            raise TypeError(f"a whole number is needed in {self.name}, and not a float")
+            raise TypeError(f"{self.name} needs an integer, but has a float; convert it with numpy.int64")
         return self.emit("i64", f"zext i1 {value.text} to i64").text if value.llvm_type == "i1" else str(value.text)
 
     def scalar(self, number: Any) -> Scalar:
-        """A number as a value."""
+        """A number as a `Scalar`."""
         if isinstance(number, bool | np.bool_):
             return Scalar("i1", self.truth(number))
         return Scalar("double", self.double(number)) if is_float(number) else Scalar("i64", self.integer(number))
@@ -180,7 +179,7 @@ class LlvmArithmetic:
         return [value if isinstance(value, Scalar) else self.scalar(value)]
 
     def types_of(self, value: Any) -> Any:
-        """The kinds of a value."""
+        """The types of a value."""
         if is_tuple(value):
             return tuple(map(self.types_of, value))
         return value.llvm_type if isinstance(value, Scalar) else self.scalar(value).llvm_type

@@ -1,4 +1,4 @@
-"""From a syntax tree to the text of LLVM."""
+"""Translation of a function's syntax tree to LLVM text."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from estimator.compilation.scalar_jit.llvm_arithmetic import (
     is_tuple,
 )
 
-#: Kinds of arguments or results (`estimator.compilation.scalar_jit.llvm_arithmetic.Scalar`), and tuples of them.
+#: LLVM types of arguments or results (`estimator.compilation.scalar_jit.llvm_arithmetic.Scalar`), and tuples of them.
 ArgumentTypes = tuple[Any, ...]
 
 
 class TranslatedFunction(NamedTuple):
-    """A function for arguments of certain kinds.
+    """A function translated for arguments of certain types.
 
     Attributes:
-        name: of its own in all compiled code: it holds a digest.
-        definitions: name to text, of the function and of those that it calls.
-        result: kinds that it returns; None where nothing.
+        name: unique name, with a digest.
+        definitions: name to LLVM text, of the function and the functions it calls.
+        result: types of its results; None for no result.
     """
 
     name: str
@@ -41,33 +41,39 @@ class TranslatedFunction(NamedTuple):
     result: Any
 
 
-#: Functions of one number, and what LLVM or the C library calls them.
+#: Functions of one number to their names in LLVM or the C library.
 _FUNCTIONS: dict[Callable[..., Any], str] = {
     math.sqrt: "llvm.sqrt.f64", np.sqrt: "llvm.sqrt.f64", math.floor: "llvm.floor.f64", abs: "llvm.fabs.f64",
     math.exp: "llvm.exp.f64", math.log: "llvm.log.f64", math.log1p: "log1p",
 }  # fmt: skip
 
-#: What every text must declare.
+#: External functions that every module declares.
 DECLARED_FUNCTIONS = tuple(sorted(set(_FUNCTIONS.values())))
 
-#: Doubles in a register of AVX-512; loops over the lanes of a block have a multiple of that as turns.
+#: Length of an AVX-512 register [doubles]; the number of lanes is a multiple.
 VECTOR_WIDTH = 8
 
-#: Lines of such a loop up to which two turns go side by side. Of long ones processors' registers do not hold two.
+#: Length of a loop body up to which two turns are interleaved [lines]; longer ones would exceed the registers.
 _MAX_INTERLEAVED_LINES = 340
 
-#: What marks them, and what their marks tell LLVM (`with_vector_metadata`).
-_LOOP_MARK, _LOOP_MARK_PATTERN = ", !llvm.loop !lanes_{}", re.compile(r", !llvm\.loop !lanes_(\d)")
+#: Mark of a loop over lanes, with the number of interleaved turns (`with_vector_metadata`).
+_LOOP_MARK = ", !llvm.loop !lanes_{}"
+
+#: Pattern of these marks.
+_LOOP_MARK_PATTERN = re.compile(r", !llvm\.loop !lanes_(\d)")
 
 _CONVERSIONS: dict[Any, str] = {np.float64: "double", np.int64: "i64", np.uint64: "word"}
 
 
 def with_vector_metadata(text: str, has_avx512: bool) -> str:
-    """The text of a module whose loops over lanes use registers of AVX-512, where there are any.
+    """Add vectorisation metadata to the marked loops over lanes of a module's text.
 
-    LLVM by itself takes half of them on Intel's processors, for the sake of code that needs wide ones here and there.
-    Loops over lanes are little else, and take less time with them. Nor does it put turns side by side where each is
-    more than a few lines; but what waits for results of its own leaves time for another turn.
+    LLVM's default on Intel processors is 256-bit vectors, and no interleaving of longer loops. Loops over lanes are
+    faster with AVX-512 and, up to a length, with two interleaved turns, which hide the latency of dependent operations.
+
+    Args:
+        text: text of the module.
+        has_avx512: whether the processor has AVX-512; without it the marks are removed.
     """
     head, *rest = _LOOP_MARK_PATTERN.split(text)
     if not rest or not has_avx512:
@@ -81,7 +87,7 @@ def with_vector_metadata(text: str, has_avx512: bool) -> str:
 
 
 def flat_types(nested_types: Any) -> list[str]:
-    """The kinds in tuples of kinds, in order; none of None."""
+    """The types in nested tuples of types, in order; an empty list for None."""
     if nested_types is None:
         return []
     return (
@@ -92,10 +98,10 @@ def flat_types(nested_types: Any) -> list[str]:
 
 
 class FunctionTranslation(LlvmArithmetic):
-    """The text of one function.
+    """The translation of one function.
 
     Args:
-        source: of the function.
+        source: the function.
     """
 
     def __init__(self, source: FunctionSource) -> None:
@@ -105,7 +111,7 @@ class FunctionTranslation(LlvmArithmetic):
         self._called: dict[str, str] = {}
 
     def function(self, argument_types: ArgumentTypes) -> TranslatedFunction:
-        """The function for arguments of these kinds."""
+        """Translate the function for arguments of these types."""
         arguments: list[Scalar] = []
 
         def argument(kind: Any) -> Any:
@@ -125,16 +131,16 @@ class FunctionTranslation(LlvmArithmetic):
             returned_struct = f"%r{i}"
         self.lines.append(f"ret {type_} {returned_struct}" if values else "ret void")
         parameters = ", ".join(f"{LLVM_TYPES[a.llvm_type]} {a.text}" for a in arguments)
-        # What has no block is called in the midst of arithmetic; what has one stays a function of its own.
+        # A function without blocks is inlined into arithmetic; a function with blocks stays a function.
         inline = "" if "ptr" in argument_types else " alwaysinline"
         body = f"({parameters}){inline} {{\nentry:\n" + "\n".join(self.lines) + "\n}\n"
-        # All that a function depends on stands in its body, or in the names of those that it calls.
+        # The body determines the function, with the names of the functions it calls.
         name = f"{self.source.function.__name__}.{hashlib.sha256(f'{type_}{body}'.encode()).hexdigest()[:16]}"
         result = None if returned is None else self.types_of(returned)
         return TranslatedFunction(name, {**self._called, name: f"define linkonce_odr {type_} @{name}{body}"}, result)
 
     def _inline(self, source: FunctionSource, arguments: Sequence[Any]) -> Any:
-        """Write a function's lines here; what it returns."""
+        """Write a function's lines in place, and return its result."""
         if len(arguments) != len(source.arguments):
             raise TypeError(
                 f"{source.name} takes {source.arguments}, but is given {len(arguments)} arguments; give all"
@@ -145,7 +151,7 @@ class FunctionTranslation(LlvmArithmetic):
         return returned
 
     def _statements(self, body: Iterable[ast.stmt], names: dict[str, Any]) -> Any:
-        """Write statements; what they return."""
+        """Write statements, and return their result."""
         for statement in body:
             match statement:
                 case ast.Return(value=None):
@@ -166,7 +172,7 @@ class FunctionTranslation(LlvmArithmetic):
         return None
 
     def _assign(self, target: ast.expr, value: Any, names: dict[str, Any]) -> None:
-        """Give a name, the parts of a tuple, or the entry of a block its value."""
+        """Assign to a name, to the parts of a tuple, or to an entry of a block."""
         match target:
             case ast.Name():
                 names[target.id] = value
@@ -180,7 +186,7 @@ class FunctionTranslation(LlvmArithmetic):
                 raise self._error(target, "cannot be assigned")
 
     def _loop(self, loop: ast.For, names: dict[str, Any]) -> None:
-        """Write a loop; what it assigns is forgotten after each turn."""
+        """Write a loop; names assigned in it are local to a turn."""
         match loop.target, loop.iter, loop.orelse:
             case ast.Name() as target, ast.Call(func=function, args=[turns], keywords=[]), []:
                 is_range = self._value(function, names) is range
@@ -210,7 +216,7 @@ class FunctionTranslation(LlvmArithmetic):
         self._block = f"done{n}"
 
     def _value(self, node: Any, names: Mapping[str, Any]) -> Any:
-        """The value of an expression: a `Scalar`, a number, a tuple, or what a name stands for."""
+        """The value of an expression: a `Scalar`, a number, a tuple, or a Python object."""
         match node:
             case ast.Constant():
                 return node.value
@@ -248,7 +254,7 @@ class FunctionTranslation(LlvmArithmetic):
         raise self._error(node, "cannot stand in a scalar_jit function")
 
     def _address(self, node: ast.Subscript, names: Mapping[str, Any]) -> str:
-        """Where the entry of a block lies."""
+        """Address of an entry of a block."""
         base = self._value(node.value, names)
         if not (isinstance(base, Scalar) and base.llvm_type == "ptr"):
             raise self._error(node, "is no entry of a block")
@@ -285,18 +291,18 @@ class FunctionTranslation(LlvmArithmetic):
         raise self._error(node, "calls a function that scalar_jit cannot compile")
 
     def _call_on_block(self, function: Any, operands: Sequence[Any]) -> None:
-        """Call a function of blocks, which is one of its own for LLVM too, and leaves its results in them."""
+        """Call a function with blocks, which writes its results into them."""
         values = tuple(self.scalar(value) if is_number(value) else value for value in operands)
         called = function.translate(self.types_of(values))
         if called.result is not None:
             raise TypeError(
-                f"{self.name} calls {function.__name__}, which returns something; let it write into a block"
+                f"{self.name} calls {function.__name__}, which has a block and a result; write the result into a block"
             )
         self._called |= called.definitions
         flat = ", ".join(f"{LLVM_TYPES[value.llvm_type]} {value.text}" for value in self.flatten(values))
         self.lines.append(f"call void @{called.name}({flat})")
 
     def _error(self, node: ast.AST, what: str) -> TypeError:
-        """That a function is not straight."""
+        """The error for code that `scalar_jit` cannot compile."""
         text = textwrap.shorten(ast.unparse(node), 60)
         return TypeError(f"{text!r} in {self.name} {what}; compile it with jit instead")

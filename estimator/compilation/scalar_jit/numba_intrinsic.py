@@ -1,4 +1,4 @@
-"""What Numba is told of a straight function: its types, and a library to link."""
+"""`scalar_jit` as a Numba intrinsic: the types of a function, and a library for linking."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _LLVMLITE_TYPES = {"double": ir.DoubleType(), "i1": ir.IntType(1), "i64": ir.Int
 
 
 class ScalarFunction(_Intrinsic):  # type: ignore[misc]
-    """A straight function: see `estimator.compilation.scalar_jit`. Numba takes it for an intrinsic of its own.
+    """A function of `estimator.compilation.scalar_jit`, as an intrinsic of Numba.
 
     Args:
-        function: as Python defined it.
-        text: that was executed to define it; None where its file holds it.
+        function: the Python function.
+        text: its source; None to read the file.
     """
 
     def __init__(self, function: Callable[..., Any], text: str | None = None) -> None:
@@ -38,7 +38,7 @@ class ScalarFunction(_Intrinsic):  # type: ignore[misc]
         self._translations: dict[ArgumentTypes, TranslatedFunction] = {}
         self._libraries: dict[ArgumentTypes, _LinkedLibrary] = {}
         arguments = ", ".join(["_typing", *self.source.arguments])
-        # Numba binds arguments by the names of what defines an intrinsic.
+        # Numba binds arguments by the parameter names of the defining function.
         define = eval(f"lambda {arguments}: _define({arguments})", {"_define": self._define})
         super().__init__(function.__name__, define)
         functools.update_wrapper(self, function)
@@ -46,24 +46,24 @@ class ScalarFunction(_Intrinsic):  # type: ignore[misc]
         self._register()
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """From Python, for what is tried out or tested."""
+        """Call the function from Python, in tests and experiments."""
         return self.compiled(*args, **kwargs)
 
     @functools.cached_property
     def compiled(self) -> Any:
-        """The function on its own, as Numba compiles it for callers in Python."""
+        """The function, compiled by Numba for callers in Python."""
         arguments = ", ".join(self.source.arguments)
         names = {"_function": self, "__name__": self.py_func.__module__}
         return numba.njit(error_model="numpy")(eval(f"lambda {arguments}: _function({arguments})", names))
 
     def translate(self, argument_types: ArgumentTypes) -> TranslatedFunction:
-        """The function for arguments of some kinds."""
+        """The function for arguments of some types."""
         if argument_types not in self._translations:
             self._translations[argument_types] = FunctionTranslation(self.source).function(argument_types)
         return self._translations[argument_types]
 
     def _define(self, _typing: Any, *numba_types: Any) -> Any:
-        """The signature for arguments of Numba's types, and what generates the call."""
+        """The signature for arguments of Numba's types, and the generator of a call."""
         argument_types = tuple(self._type_of(types.unliteral(type_)) for type_ in numba_types)
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -94,14 +94,14 @@ class ScalarFunction(_Intrinsic):  # type: ignore[misc]
         return _pack(context, builder, signature.return_type, translation.result, values)
 
     def _type_of(self, type_: Any) -> Any:
-        """The kind of Numba's type.
+        """The LLVM type of Numba's type.
 
         Raises:
-            TypeError: for another type than numbers, tuples and flat arrays.
+            TypeError: for other types than numbers, tuples and flat arrays.
         """
         if isinstance(type_, types.Array):
             if (type_.dtype, type_.ndim, type_.layout) != (types.float64, 1, "C"):
-                raise TypeError(f"{self._name} needs flat, contiguous float64 arrays, but is given {type_}")
+                raise TypeError(f"{self._name} needs flat, contiguous float64 arrays, but is given {type_}; convert it")
             return "ptr"
         if isinstance(type_, types.Tuple | types.UniTuple):
             return tuple(map(self._type_of, type_.types))
@@ -111,7 +111,7 @@ class ScalarFunction(_Intrinsic):  # type: ignore[misc]
             return "i1"
         if isinstance(type_, types.Integer):
             return "word" if type_ == types.uint64 else "i64"
-        raise TypeError(f"{self._name} takes numbers, tuples of them and flat arrays, but is given {type_}")
+        raise TypeError(f"{self._name} takes numbers, tuples of them and flat arrays, but is given {type_}; convert it")
 
 
 def scalar_jit(function: Callable[..., Any]) -> Any:
@@ -120,16 +120,16 @@ def scalar_jit(function: Callable[..., Any]) -> Any:
 
 
 def scalar_jit_from_source(source: str) -> Callable[[Callable[..., Any]], Any]:
-    """As `scalar_jit`, for functions of a source that is executed, and need not be in a file."""
+    """As `scalar_jit`, for functions defined by executing ``source``."""
     return lambda function: ScalarFunction(function, source)
 
 
 class _LinkedLibrary:
-    """A translated function as Numba links it: with the data layout of the module that calls it.
+    """A translated function for linking, with the data layout of the calling module.
 
     Args:
-        translation: of the function.
-        calling_module: the module.
+        translation: the translated function.
+        calling_module: the calling module.
         has_avx512: whether the processor has AVX-512.
     """
 
@@ -141,14 +141,14 @@ class _LinkedLibrary:
         self._reload_init: set[str] = set()
 
     def _ensure_finalized(self) -> None:
-        """There is nothing to finish."""
+        """Nothing to finalise."""
 
     def _get_module_for_linking(self) -> binding.ModuleRef:
         return self._module
 
 
 def _numba_type(flat_or_nested: Any) -> Any:
-    """Numba's type of kinds."""
+    """Numba's type of an LLVM type, or of nested ones."""
     if flat_or_nested is None:
         return types.none
     return (
@@ -159,7 +159,7 @@ def _numba_type(flat_or_nested: Any) -> Any:
 
 
 def _unpack(context: Any, builder: Any, kind: Any, type_: Any, value: Any) -> Iterator[Any]:
-    """The numbers in a value of Numba's; of an array, where it lies."""
+    """The numbers in a value of Numba's; of an array, its address."""
     if kind == "ptr":
         yield context.make_array(type_)(context, builder, value).data
     elif isinstance(kind, tuple):
@@ -170,7 +170,7 @@ def _unpack(context: Any, builder: Any, kind: Any, type_: Any, value: Any) -> It
 
 
 def _pack(context: Any, builder: Any, type_: Any, kinds: Any, values: Iterator[Any]) -> Any:
-    """The next numbers as a value of Numba's."""
+    """A value of Numba's from the next numbers."""
     if not isinstance(kinds, tuple):
         return next(values)
     parts = [_pack(context, builder, type_.types[i], kind, values) for i, kind in enumerate(kinds)]
