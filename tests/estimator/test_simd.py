@@ -43,7 +43,7 @@ def test_rows_are_numbered_in_order():
 
 
 def test_rows_refuse_a_repeated_name():
-    with pytest.raises(ValueError, match=re.escape("every row once, but ['b'] twice; rename them; rename")):
+    with pytest.raises(ValueError, match=re.escape("every row once, but has ['b'] twice; rename them")):
         number_rows("a b", "c b")
 
 
