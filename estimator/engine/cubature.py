@@ -104,7 +104,7 @@ def propagate_point(model: Model, degree: int) -> Assignments:
 
 
 def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str]]:
-    """A whole sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``I_P``."""
+    """A sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``I_P``."""
     lines, _ = place_point(model)
     named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}

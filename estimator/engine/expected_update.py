@@ -34,15 +34,16 @@ class ExpectedUpdate:
         advance: ``advance(W, record, walk)``: one sample without data in every lane. ``record`` is the flat record of a
             belief, for the means of the coefficients and precisions; ``walk`` (K,) are the variances of the
             coefficients' random walk before the sample. It writes the predicted output of the first sensor into
-            ``SHOWN``, its variance into ``SPREAD``, and into ``SURPRISE`` the variance by which the output before, if
-            it was predicted too, will shift the prediction.
-        final_information: ``final_information(W, M, s)``: writes ½ log det(C⁻¹ + s² M Mᵀ) [nats] into ``KNOWN``, with C
-            the coefficients' covariance and M (K, K), lower triangular, the factor of the information beyond the plan;
-            `DIVERGED_SCORE` where C is no covariance.
+            ``SHOWN``, its variance into ``SPREAD``, and into ``SURPRISE`` the variance by which
+            the output before, if it was predicted too, will shift the prediction.
+        final_information: ``final_information(W, M, s)``: writes ½ log det(C⁻¹ + s² M Mᵀ) [nats] into
+            ``KNOWN``, with C the coefficients' covariance and M (K, K), lower triangular, the factor of the
+            information beyond the plan; `DIVERGED_SCORE` where C is no covariance.
         layout: row number of each quantity. The first rows are the memory of a plan between two samples: the states,
-            the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``BEGUN``, which is 0
-            before the first sample. A differential equation adds its states in the middle and at the end of the last
-            sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the caller's.
+            the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``BEGUN``,
+            which is 0 before the first sample. A differential equation adds its states in the middle and at the end of
+            the last sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` belong to the
+            caller.
         kept: number of rows of that memory.
     """
 

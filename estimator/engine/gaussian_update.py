@@ -106,7 +106,7 @@ class GaussianUpdate:
         return tuple(tuple(entries[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
 
     def _predict(self) -> None:
-        """Q = S P Sᵀ in the states' rows, or the given ``Q_i_j`` where there is no S; the coefficients' block stays."""
+        """Q = S P Sᵀ in the states' rows, or the given ``Q_i_j`` if there is no S; the coefficients' block stays."""
         names, jacobian, rows = self.names, self.propagation.jacobian, self.transition_cov
         for a, i in enumerate(names):
             for j in names[a:]:
@@ -300,11 +300,11 @@ def belief_update(
 
 
 def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:
-    """`belief_update` with every output equal to its prediction, and given noise variances ``Q`` and ``R_<sensor>``.
+    """`belief_update` with every output equal to its prediction, and given noise variances.
 
-    It writes the predicted output of the first sensor into ``SHOWN``, its variance into ``SPREAD``, and
-    `GaussianUpdate.pending_output_variance` into ``SURPRISE``; ``BEGUN`` is 0 before the first sample, for which the
-    latter is 0.
+    The noise variances are in ``Q`` and ``R_<sensor>``. The results are the predicted output of the
+    first sensor in ``SHOWN``, its variance in ``SPREAD``, and `GaussianUpdate.pending_output_variance`
+    in ``SURPRISE``, which is 0 for the first sample: ``BEGUN`` is 1 after it.
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}

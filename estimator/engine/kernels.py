@@ -48,8 +48,8 @@ class BeliefUpdate:
     Attributes:
         update: ``update(W)``: updates the belief of every lane by its rows ``U_k`` and ``Y_<sensor>``.
         layout: row number of each quantity.
-        count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``UNSOUND`` of lanes whose covariance
-            is not positive semi-definite; ``update`` does so at its start.
+        count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``UNSOUND`` of lanes
+            whose covariance is not positive semi-definite; ``update`` does so at its start.
     """
 
     update: Any
@@ -192,8 +192,8 @@ class LinearisedFilter:
 
     Attributes:
         sample: ``sample(W)``: one sample of every lane.
-        layout: row number of each quantity: the coefficients, the input, outputs, ``LIVE``, the noise variances ``Q``
-            and ``R_<sensor>``, the filter's state and its totals.
+        layout: row number of each quantity: the coefficients, the input, outputs, ``LIVE``, the noise
+            variances ``Q`` and ``R_<sensor>``, the filter's state and its totals.
         lanes: lanes of the block.
     """
 

@@ -30,8 +30,8 @@ def linearised_filter_step(
 
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
-    Rows are `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`, the noise variances ``Q``
-    and ``R_<sensor>``, and ``LIVE``, which is 0 where the sample does not count.
+    Rows are `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`, the noise variances
+    ``Q`` and ``R_<sensor>``, and ``LIVE``, which is 0 where the sample does not count.
 
     Args:
         model: the equation.

@@ -26,7 +26,7 @@ def input_rows(model: Model, degree: int) -> list[str]:
 
 
 def integrator_rows(model: Model) -> list[str]:
-    """Quantities that the integrator of a differential equation steps: M, S and N, or D where the noise is held.
+    """The integrator's quantities in a differential equation: M, S and N, or D where the noise is held.
 
     Empty for a difference equation.
     """
