@@ -158,7 +158,7 @@ def source_digest(folders: tuple[Path, ...]) -> str:
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(folder.rglob("*.py")):
-            # Generated source stands there too, and is a function of the rest.
+            # Generated source is there too, and is a function of the rest.
             if path.parent.name != "__pycache__":
                 digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -42,8 +42,8 @@ class ExpectedUpdate:
         layout: row number of each quantity. The first rows are the memory of a plan between two samples: the states,
             the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``BEGUN``,
             which is 0 before the first sample. A differential equation adds its states in the middle and at the end of
-            the last sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` belong to the
-            caller.
+            the last sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the
+            caller's.
         kept: number of rows of that memory.
     """
 

@@ -1,4 +1,4 @@
-"""One estimator of every kind, and records of oscillators that they find."""
+"""One estimator of every kind, and records of oscillators."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -13,7 +13,7 @@ TRUTH = Parameters(zip(difference().coefficients, coefficients_of(difference(), 
 #: The physical equation as the Silverbox needs it.
 ODE = duffing(offsets=True, feedthrough=True, noise="held")
 
-#: Of a difference equation that nobody else has.
+#: A difference equation of this test alone.
 TERMS = (Term(1), Term(3), Term(0, 1), Term(1, 1), Term(tap=0), Term(tap=1), Term(tap=2))
 
 #: As a rig with a guess is estimated, with an input that is known a sample later.

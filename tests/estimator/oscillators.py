@@ -20,7 +20,7 @@ WELLS = ({"m": 0.4, "c": 0.6, "a": -2500.0, "b": 4e7}, 1e-3, 6.0, 2e-6, 16)
 
 
 def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start=0.0):
-    """Input and output of a record that begins at rest, with the force disturbed by so many parts of the input.
+    """Input and output of a record that begins at rest, with a force disturbance as a fraction of the input.
 
     It begins at a displacement ``start`` [m]. The plant is the engine's, without what the benchmark's own integrator is
     for.
@@ -40,7 +40,7 @@ def simulated(case, seed=0, samples=2048, kind="displacement", force=3e-3, start
 
 
 def struck(blows, rate, kind, lasting, seconds=2.0):
-    """Rig and record of a bench of 0.35 kg that blows (times) strike which last so long [s]."""
+    """Rig and record of a bench of 0.35 kg under blows at given times, of given length [s]."""
     truth, scales = (
         {"m": 0.35, "c": 0.8, "a": 1800.0, "b": 3e7},
         Scales(1 / rate, 100.0, 1e-2, DERIVATIVE_ORDER_OF_SENSOR[kind]),

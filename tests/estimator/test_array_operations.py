@@ -1,4 +1,4 @@
-"""Arrays, number by number."""
+"""Array operations in compiled code."""
 
 import numba
 import numpy as np

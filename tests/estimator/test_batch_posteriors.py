@@ -1,4 +1,4 @@
-"""Many records at once: the beliefs of one estimator after the other."""
+"""Posteriors of many records at once equal single estimators' beliefs."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""`Belief`: what it refuses, what it answers, and that nobody can write into it."""
+"""`Belief`: checks, properties, and immutability."""
 
 import dataclasses
 import re
@@ -11,7 +11,7 @@ from tables import table
 from estimator.belief import Belief
 from estimator.models.model import Model
 
-#: A model whose coefficients have no other face.
+#: A model without physical parameters.
 MODEL = Model(
     "oscillator",
     {"x": "V", "v": "V"},

@@ -1,4 +1,4 @@
-"""Compiled and generated code on disk: kept, damaged, and where nothing can be kept."""
+"""The caches of compiled and generated code: reuse, damage, and unwritable folders."""
 
 import gc
 import importlib
@@ -53,7 +53,7 @@ def fresh():
 
 
 def called():
-    """What a fresh kernel gives, and whether its code came from disk."""
+    """The result of a new kernel, and whether its code came from disk."""
     run = fresh().run
     return run(21), sum(run.stats.cache_hits.values())
 
@@ -68,7 +68,7 @@ def test_compiled_code_is_read_again(place):
 
 
 def test_code_that_calls_what_numba_brings_is_read_by_another_process(tmp_path):
-    """The symbols of BLAS are there only once Numba has imported what brings them."""
+    """The symbols of BLAS are loaded only after Numba has imported them."""
     source = "from estimator.compilation.simd import kernel\n@kernel\ndef run(x):\n    return x @ x\n"
     (tmp_path / "run_of_compiled.py").write_text(source)
     program = "import numpy as np\nfrom run_of_compiled import run\n"
@@ -130,7 +130,7 @@ def test_functions_with_other_surroundings_have_other_code(place):
 
 
 def nowhere(monkeypatch, tmp_path):
-    """No folder can be made: all wishes lead below a file."""
+    """No folder can be made: all candidates are below a file."""
     (tmp_path / "file").write_text("")
     for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "file" / "folder"))
@@ -182,7 +182,7 @@ def test_the_package_starts_without_a_home_and_with_nothing_to_write(tmp_path):
 
 
 def loaded():
-    """What generated source gives, and how often it was generated."""
+    """The result of generated source, and how often it was generated."""
     made = []
 
     def make():
@@ -223,7 +223,7 @@ def test_damaged_source_is_generated_anew_in_silence(place, damage):
 
 
 class Timer:
-    """Rings at once where it would before a compilation is over that takes 1.5 s."""
+    """A timer that fires at once if its delay is below a compilation time of 1.5 s."""
 
     asked: ClassVar[list[float]] = []
 
@@ -252,7 +252,7 @@ def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
 
 
 def test_what_took_longer_than_the_timer_could_say_is_said_of_the_next(place, monkeypatch):
-    """Where the timer is late, on a busy machine."""
+    """A timer that is late, as on a busy machine."""
     monkeypatch.setattr(Timer, "asked", [])
     watching = disk_cache.CompilationNotice(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
     event.register("numba:compile", watching)

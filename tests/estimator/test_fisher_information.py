@@ -206,7 +206,7 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
         np.testing.assert_array_equal(found.information, np.swapaxes(found.information, 1, 2))
     if model.is_continuous:
         return
-    # In standard deviations. Left out is what S and the gain tell, which is as small as the noise beside u.
+    # In standard deviations. F omits the information in S and the gain, whose share is as small as the noise beside u.
     for j, h in enumerate(1e-3 * std * np.eye(len(c))):
         up, down = (along(case, u[1], q, r, y[1], begin[1], spread**2, c + s * h).loss for s in (1, -1))
         assert found.gradient[1, j] * std[j] == pytest.approx((up - down) / 2e-3, abs=0.02)

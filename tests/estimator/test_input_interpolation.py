@@ -1,4 +1,4 @@
-"""The input between the samples: taps, and polynomials that pass through the inputs."""
+"""Interpolation of the input: taps, and polynomials through the inputs."""
 
 import re
 
@@ -12,7 +12,7 @@ from estimator.inference.input_interpolation import input_stencil
 
 
 def rows(model, rig, u):
-    """(T, rows) what a model takes on the way to each sample."""
+    """(T, rows) taps or polynomial coefficients of each sample."""
     way = input_stencil(model, rig)
     if way.needs_whole_record:
         return way.spline_coefficients(u)

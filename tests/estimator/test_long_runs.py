@@ -1,4 +1,4 @@
-"""A million samples of the record: every covariance stays sound, nothing runs away, memory stays what it was."""
+"""A million samples: covariances stay positive semi-definite, estimates and memory stay bounded."""
 
 import resource
 
@@ -26,7 +26,7 @@ ESTIMATORS = {
 
 
 def soundness(cov):
-    """The smallest eigenvalue of the correlations of what is not known."""
+    """The smallest eigenvalue of the correlations of the unknown quantities."""
     std = np.sqrt(np.diag(cov))
     free = std > 0
     return np.linalg.eigvalsh(cov[np.ix_(free, free)] / np.outer(std[free], std[free]))[0]

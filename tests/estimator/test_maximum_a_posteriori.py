@@ -1,4 +1,4 @@
-"""The auditor: against a general optimiser on a likelihood by hand, and calibrated on simulated truth."""
+"""Maximum a posteriori: against a general optimiser on a plain likelihood, and calibration on simulated truth."""
 
 import numpy as np
 import pytest

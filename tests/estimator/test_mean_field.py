@@ -1,4 +1,4 @@
-"""The mean-field update against its equations with matrices, and against what its free energy must be."""
+"""The mean-field update and its free energy against their equations with matrices."""
 
 import re
 

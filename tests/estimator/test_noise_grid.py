@@ -1,4 +1,4 @@
-"""Hypotheses about the noise ratio: the mixture against its definition, and whether it finds the ratio."""
+"""Noise hypotheses: the mixture against its definition, and recovery of the true ratio."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def ensemble(name):
 
 
 def members(name):
-    """The same members as estimators of their own, with the priors that the documentation says."""
+    """The members as single estimators, with the documented priors."""
     model, prior = MODELS[name]["model"], MODELS[name]["prior"]
     for level in (1 / 3, 1, 3):
         for factor in (1 / 30, 30**-0.5, 1, 30**0.5, 30):
@@ -61,7 +61,7 @@ def members(name):
 
 
 def mixed(weights, energies, predictions):
-    """The twin of `weigh`, in logarithms: weights, free energies (T, iterations), forecasts (T, 2)."""
+    """The mixture in logarithms: weights, free energies (T, iterations), forecasts (T, 2)."""
     log_weights, free_energies, forecasts = np.log(weights), [], []
     for F, (means, variances) in zip(energies.transpose(1, 2, 0), predictions.transpose(1, 2, 0), strict=True):
         w = (1 - SWITCHING_PROBABILITY) * np.exp(log_weights) + SWITCHING_PROBABILITY / len(weights)
@@ -280,7 +280,7 @@ def noisy(process_noise, measurement_noise, samples):
 
 
 def test_alone_the_difference_of_the_precisions_hardly_moves():
-    """What the module's first lines derive, and why there are hypotheses at all."""
+    """A single filter keeps the difference E[γ] - E[ξ] of its priors (module docstring)."""
     prior = silverbox_prior(process_noise=2e-3 / 3, measurement_noise=1e-3 / 3)
     estimator = OnlineEstimator(None, prior)
     estimator.run(*noisy(2e-3, 1e-3, 600))

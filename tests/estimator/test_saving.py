@@ -1,4 +1,4 @@
-"""Estimators in files: they continue bit by bit, and nothing but our own whole files is read."""
+"""Saved estimators continue bit by bit, and all other files are refused."""
 
 import io
 import json
@@ -35,7 +35,7 @@ def test_a_saved_estimator_continues_bit_by_bit(kind, tmp_path):
 
 @pytest.fixture
 def written(tmp_path):
-    """The place of a file of an estimator that has a sample waiting, and its arrays."""
+    """The path of a file of an estimator with a stored sample, and its arrays."""
     path = tmp_path / "estimator.npz"
     estimator = KINDS["ode, look-ahead"]()
     estimator.run(*record(12))

@@ -1,4 +1,4 @@
-"""Lanes: names of rows, compiled loops, and the stamp of the cache."""
+"""SIMD lanes: numbered rows, compiled loops, and the digest of the sources."""
 
 import ast
 import importlib
@@ -31,7 +31,7 @@ def test_an_inner_function_is_called_from_compiled_code_and_from_python():
         return twice(x) + twice(1, x)
 
     assert (caller(3.0), twice(3.0), twice(2, y=2)) == (12.0, 7.0, 6)
-    # For the caller it was compiled for two sorts of arguments. Nothing of them is where Python could enter.
+    # The caller needed two overloads, and none of them has an entry for Python.
     assert len(twice.overloads) == 2
     for compiled in (*twice.overloads.values(), *caller.overloads.values()):
         engine, named = compiled.library.codegen._engine, compiled.fndesc.llvm_cpython_wrapper_name
@@ -154,7 +154,7 @@ def test_a_cached_kernel_follows_the_functions_it_calls(tmp_path, monkeypatch):
 
 
 def test_functions_that_differ_have_names_that_differ():
-    """The linker takes one of two functions of a name for both, where two processes compiled them."""
+    """The linker takes two functions of one name for the same, if two processes compiled them."""
     layout = number_rows("p q r s")
 
     def double(p):

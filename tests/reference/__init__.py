@@ -1,1 +1,1 @@
-"""What the packages have to compute, in plain NumPy: with matrices, straight from the equations, and nothing shared."""
+"""Reference implementations in plain NumPy, with matrices, directly from the equations."""

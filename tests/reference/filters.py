@@ -1,4 +1,4 @@
-"""Motion, extended Kalman filter and Fisher information of any model, with matrices.
+"""Simulation, extended Kalman filter and Fisher information of any model, with matrices.
 
 Derivatives are taken by a complex step: with f analytic, Im f(x + iε)/ε is its derivative to rounding for ε = 1e-30,
 and through an integrator it is the derivative of the integrator's own arithmetic.
@@ -108,7 +108,7 @@ def acting(plant: Plant, u: np.ndarray, t: int, interpolation: str) -> tuple[flo
 
 
 def input_seen(plant: Plant, inputs: Sequence[float]) -> float:
-    """The input that a sensor sees at the end of a sample: the newest tap, or the polynomial there."""
+    """The input at the end of a sample: the newest tap, or the polynomial's value."""
     return polynomial(inputs, 1.0) if plant.substeps else inputs[0]
 
 
@@ -121,7 +121,7 @@ def moved(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) -
 
 
 def spread(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) -> np.ndarray:
-    """N (n, n), the covariance that unit process noise gives the state over a sample."""
+    """N (n, n), covariance of the state by unit process noise over a sample."""
     n = len(z)
     if not plant.substeps:
         g = np.array(plant.noise(z, c), dtype=float)

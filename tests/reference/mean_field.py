@@ -1,4 +1,4 @@
-"""The paper's mean field in plain NumPy: one update with matrices, straight from the equations.
+"""The paper's mean field in plain NumPy: one update with matrices, directly from the equations.
 
 It shares no code and no formula with `estimator.inference.mean_field`: where that updates by rank one, this builds the
 precision matrix and inverts it; where that has a closed form for a divergence, this uses the general one.
@@ -142,7 +142,7 @@ def expected_log_normal(power, precision):
 
 
 def random_prior(rng, nonlinear=True):
-    """A belief at random, of quantities and noises about as large as those of the Silverbox, factors correlated."""
+    """A random belief with correlated factors, at the scale of the Silverbox."""
     mean = rng.normal([0.1, 0.1, 1.4, -2.0, -0.9, 0.4], [0.2, 0.2, 0.4, 2.0, 0.2, 0.2])
     std = np.exp(rng.uniform(np.log(1e-3), np.log(0.3), 6))
     factor = rng.standard_normal((6, 8))

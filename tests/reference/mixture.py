@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import logsumexp
 
-#: Part of the weight that every sample gives back to all members alike.
+#: Fraction of the weight that every sample distributes evenly over all members [1].
 FORGOTTEN = 1e-6
 
 

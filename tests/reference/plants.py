@@ -1,4 +1,4 @@
-"""Models that only tests have: what somebody who adds a plant has to write."""
+"""Models of the tests, as a user would write them."""
 
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing

@@ -139,7 +139,7 @@ def _told(
     y: Sequence[float],
     iterations: int,
 ) -> Outcome:
-    """What outputs tell a belief that has moved to ``mean`` and ``cov`` without process noise.
+    """Update of a predicted belief by outputs; ``mean`` and ``cov`` are without process noise.
 
     Sensor by sensor; q(γ) is told by the first that shows process noise, all of whose variance N comes with it.
     """

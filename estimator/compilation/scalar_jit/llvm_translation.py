@@ -168,7 +168,7 @@ class FunctionTranslation(LlvmArithmetic):
                 case ast.Expr():
                     self._value(statement.value, names)
                 case _:
-                    raise self._error(statement, "cannot stand in a scalar_jit function")
+                    raise self._error(statement, "is not allowed in a scalar_jit function")
         return None
 
     def _assign(self, target: ast.expr, value: Any, names: dict[str, Any]) -> None:
@@ -251,7 +251,7 @@ class FunctionTranslation(LlvmArithmetic):
                 return self.select(self.truth(truth), self._value(node.body, names), self._value(node.orelse, names))
             case ast.Call():
                 return self._call(node, names)
-        raise self._error(node, "cannot stand in a scalar_jit function")
+        raise self._error(node, "is not allowed in a scalar_jit function")
 
     def _address(self, node: ast.Subscript, names: Mapping[str, Any]) -> str:
         """Address of an entry of a block."""

@@ -1,4 +1,4 @@
-"""Models with their equations written again as ordinary functions, random beliefs for them, and blocks of lanes."""
+"""Models with plain reference functions, random beliefs, and blocks of lanes, for the engine's tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
 from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 
-#: Drag, which is quadratic in the speed, and a sensor that shows no sign.
+#: Drag, quadratic in the speed, and a sensor without sign.
 DRAG = replace(SIGNED_DRAG, outputs={"y": "abs(x)"})
 
 
@@ -140,7 +140,7 @@ CASES = {
     ),
 }  # fmt: skip
 
-#: One configuration of each of the five models that are nowhere bent.
+#: One configuration of each of the five smooth models.
 FIVE = ("duffing", "paper", "pendulum", "wiener-hammerstein", "van der pol")
 
 
@@ -195,7 +195,7 @@ def block(layout, lanes: int) -> np.ndarray:
 
 
 def assert_agrees(actual: Belief, outcome, operations: int) -> None:
-    """Within the rounding of so many operations on end, enlarged by the outcome's condition."""
+    """Equality within the rounding of successive operations, times the condition number."""
     tolerance = EPS * operations * outcome.condition
     assert tolerance < 1e-6, "the case is too badly conditioned to tell anything"
     expected, scale = outcome.belief, outcome.scale

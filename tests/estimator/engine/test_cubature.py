@@ -41,7 +41,7 @@ def assert_equals_reference(case, task, samples):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_update_equals_its_equations(name):
-    """With an output missing in a lane, and quantities that are known in others."""
+    """Lanes with a missing output, and lanes with known quantities."""
     case = CASES[name]
     samples = some_samples(case, 11)
     samples[0][2][:] = np.nan
@@ -142,7 +142,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
             known = std == 0
             assert (cov[known] == 0).all()
             std[known] = 1.0
-            # Pivots down to -ROUNDING, and what dead columns leave, √ROUNDING of two standard deviations.
+            # Pivots down to -ROUNDING, and in inactive columns √ROUNDING of two standard deviations.
             assert np.linalg.eigvalsh(cov / np.outer(std, std))[0] >= -len(std) * np.sqrt(PIVOT_TOLERANCE)
             sound += 1
     assert sound > 20

@@ -109,7 +109,7 @@ def test_noise_that_depends_on_the_state_may_vanish():
 
 
 def test_what_is_generated_names_nothing_twice():
-    """Names of a model that look like those of stages, lanes and loops."""
+    """A model with the engine's own names for stages, lanes and loops."""
     model = Model(
         "odd", {"j": "1", "j_a": "1", "j_e": "1"}, {"s": "1", "lane": "1"}, noise=("1", "0", "0"), outputs={"w": "j"},
         rates=("j_a - s*j", "lane*u - j", "j - j_e"), substeps=2,
@@ -125,7 +125,7 @@ def test_what_is_generated_names_nothing_twice():
 
 @pytest.mark.parametrize(("name", "scale"), [("paper", 1e9), ("duffing", 1e3), ("wiener-hammerstein", 1e3)])
 def test_a_covariance_stays_one_whatever_the_samples(name, scale):
-    """Samples that tell 1e18 times more than was known, and slopes that are too steep for the steps."""
+    """Samples with 1e18 times the prior information, and rates too fast for the steps."""
     case = CASES[name]
     task = kernels.compile_belief_update(case.model, case.degree, lanes=LANES)
     rng = np.random.default_rng(11)

@@ -1,4 +1,4 @@
-"""The generated path against its equations with matrices, and its gradient by the inputs against differences."""
+"""The linearised filter against its equations with matrices, and its adjoint against finite differences."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def matrix(W, layout, lanes, lane, rows, columns):
 
 
 def walked(case, task, walks, observed):
-    """Run lanes over their samples: the block, and what was shown by sample."""
+    """Run lanes over their samples: the block, and the predicted outputs by sample."""
     lanes = task.lanes
     W, shown = block(task.layout, lanes), []
     for lane, (z, V, c, _, R, _) in enumerate(walks):
@@ -94,7 +94,7 @@ def assert_equals_reference(case, task, observed):
     lanes, lane, layout = task.lanes, task.lanes - 1, task.layout
     at = lambda row: W[layout[row] * lanes + lane]  # noqa: E731
     states, names = list(case.model.states), list(case.model.coefficients)
-    # Every sample rounds, and what it rounds grows as the plant lets it; sensitivities sum over so many samples.
+    # Every sample rounds, and rounding errors grow with the plant; sensitivities sum over the samples.
     tolerance = EPS * case.operations * SAMPLES * expected.growth**2
     assert tolerance < 1e-8
     F = expected.information
@@ -121,7 +121,7 @@ def assert_equals_reference(case, task, observed):
 
 @pytest.mark.parametrize("name", [*FIVE, "drag"])
 def test_the_information_is_that_of_the_responses_slopes(name):
-    """Without process noise and from a known state, F is the sum of slopes of what is shown, over r."""
+    """Without process noise and from a known state, F is the sum of squared output slopes, over r."""
     case = CASES[name]
     z, V, c, inputs, R, _ = some_walk(case, 2)
     task = kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=False, lanes=1)
@@ -148,7 +148,7 @@ def test_the_information_is_that_of_the_responses_slopes(name):
 
 
 def pieces_of(case, name, monkeypatch):
-    """The gradient's code: compiled for two equations, and as the plain Python that it is for the others."""
+    """The adjoint: compiled for two equations, and as plain Python for the others."""
     if name in ("paper", "pendulum"):
         return adjoint.compile_adjoint(case.model, case.degree)
     with monkeypatch.context() as plain:
@@ -159,7 +159,7 @@ def pieces_of(case, name, monkeypatch):
 
 @pytest.mark.parametrize("name", [*FIVE, "drag"])
 def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
-    """Of a weighted sum of all that the path leaves, with process noise and an uncertain start, along some inputs."""
+    """For a weighted sum of all results, with process noise and an uncertain start."""
     case = CASES[name]
     code = pieces_of(case, name, monkeypatch)
     z, V, c, _, R, _ = some_walk(case, 3)
@@ -170,7 +170,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
     inputs, C, N = 0.1 * rng.standard_normal(SAMPLES), code.coefficients(c), code.noises(np.array([NOISE, *R]))
 
     def forward(u, tape):
-        """What the path leaves, its information, and what the first sensor shows."""
+        """The final filter state, the information, and the first sensor's outputs."""
         (P, F), seen = code.begin(begun), []
         for t in range(SAMPLES):
             P, F, shown, _ = code.step(P, F, C, laid(u, t), N, tape, t)
@@ -182,7 +182,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
 
     tape = np.empty((SAMPLES, code.n_tape))
     ends = forward(inputs, tape)
-    # Weights of a size that lets everything count alike.
+    # Weights that scale all results to the same size.
     weights = [rng.standard_normal(end.shape) / np.maximum(np.abs(end), 1e-3) for end in ends[:2]]
     weights.append(rng.standard_normal(SAMPLES))
     G, found = tuple(weights[0]), np.zeros(SAMPLES + 2)

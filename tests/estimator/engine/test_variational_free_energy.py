@@ -1,4 +1,4 @@
-"""The free energy of the generated update, from what it leaves in its trace."""
+"""The free energy of the compiled update, from its trace."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ ITERATIONS = 3
 
 @pytest.mark.parametrize("name", ["duffing", "paper", "pendulum"])
 def test_free_energies_equal_their_definition(name):
-    """Over one and over two sensors, of which only the first tells of the process noise."""
+    """One sensor, and two of which only the first informs the process noise."""
     case = CASES[name]
     task = kernels.compile_belief_update(
         case.model, case.degree, iterations=ITERATIONS, lanes=LANES, keep_trace=True, may_be_missing=True
