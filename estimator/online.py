@@ -283,8 +283,7 @@ class OnlineEstimator:
 
         Args:
             u: (T,) inputs.
-            y_init: between 2 and T first outputs, from which the run starts. The paper's model starts from the last two
-                as measured, other models from a filter's state.
+            y_init: 2 to T first outputs. The run starts from the last two in the paper's model, else from a filter.
 
         Returns:
             Simulated outputs (T,) or (T, sensors); inf or NaN after the model diverges.
