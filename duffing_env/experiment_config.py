@@ -34,7 +34,6 @@ from estimator.support.argument_checks import (
     short_repr,
 )
 from estimator.support.array_types import FloatArray
-from estimator.support.array_types import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, FloatArray
 from estimator.support.update_options import DEFAULT_ITERATIONS, MAX_ITERATIONS
 
 #: Largest number of noise ratios, or of values of each noise: more are not worth their time.

@@ -21,7 +21,6 @@ from estimator.settings import EstimatorSettings, checked_settings
 from estimator.support.argument_checks import to_finite_series, to_scalar
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import show_progress
-from estimator.support.progress import show_progress as shown
 from estimator.support.update_options import DEFAULT_ITERATIONS
 
 #: Samples between two reports of progress.

@@ -14,7 +14,12 @@ EXCEPTIONS: dict[str, str] = {}
 
 
 def modules():
-    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py")) if "__pycache__" not in path.parts]
+    return [
+        path
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if "__pycache__" not in path.parts
+    ]
 
 
 def functions(path):
@@ -33,7 +38,9 @@ def functions(path):
 def size_faults(function):
     """What is too large about a function."""
     arguments = function.args
-    named = [a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs) if a.arg not in ("self", "cls")]
+    named = [
+        a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs) if a.arg not in ("self", "cls")
+    ]
     lines = function.end_lineno - function.lineno + 1
     faults = [f"{lines} lines"] if lines > FUNCTION_LINES else []
     return faults + ([f"{len(named)} parameters"] if len(named) > PARAMETERS else [])
@@ -46,7 +53,9 @@ def test_no_module_is_too_long():
 
 
 def test_no_function_is_too_long_but_those_that_are_named():
-    faults = {name: found for path in modules() for name, function in functions(path) if (found := size_faults(function))}
+    faults = {
+        name: found for path in modules() for name, function in functions(path) if (found := size_faults(function))
+    }
     assert {name: found for name, found in faults.items() if name not in EXCEPTIONS} == {}
     assert sorted(set(EXCEPTIONS) - set(faults)) == [], "these are short enough now: take their names off the list"
 

@@ -10,11 +10,9 @@ from typing import Any
 from estimator.identification.data.record_files import read_record_file
 from estimator.identification.data.text_tables import read_table
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
-from estimator.rigs.channel import Channel
-from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
 from estimator.models.interpolation import INTERPOLATION_DEGREES
-from estimator.rigs.rig import Channel, Rig
-from estimator.rigs.rig_toml import to_toml
+from estimator.rigs.channel import Channel
+from estimator.rigs.rig import Rig
 from estimator.rigs.units import conversion_factor, to_si_unit
 from estimator.support.argument_checks import mask_control_codes
 

@@ -148,7 +148,7 @@ def compile_update(spec: KernelSpec) -> Any:
     """``update(W)``, or of mean field ``update(W, iterations, as_published)``: the belief after a sample."""
     row_of = block_layout(spec)
     if spec.factorisation == "mean_field":
-        return mean_field.compile_mean_field_loop(row_of)
+        return mean_field.compile_mean_field_update(row_of)
     trace = spec.reward_hooks == "free_energy"
     return compile_belief_update(
         spec.belief_model, spec.degree, iterations=spec.iterations, block_layout=row_of, keep_trace=trace

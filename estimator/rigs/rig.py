@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMENSIONS, duffing
-from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.rigs.channel import Channel

@@ -12,8 +12,6 @@ from estimator.identification.fitting.search_result import SearchResult
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
 from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
-from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, INTERPOLATION_DEGREES, MAX_DELAY
-from estimator.identification.likelihood.laplace_fit import FitHypothesis, LaplaceFitter
 from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, MAX_DELAY
 from estimator.support.array_types import FloatArray

@@ -16,8 +16,6 @@ from estimator.identification.likelihood.identification_problem import Identific
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
-from estimator.inference.fisher_information import filter_records
-from estimator.identification.likelihood.laplace_fit import CoefficientPrior, FitHypothesis, LaplaceFitter
 from estimator.inference.noise_grid import moment_matched_gamma
 from estimator.inference.record_filter import filter_records
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR

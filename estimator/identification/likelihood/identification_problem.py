@@ -23,8 +23,7 @@ from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMEN
 from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.rigs.channel import Channel
-from estimator.rigs.rig import INTERPOLATION_DEGREES, Rig
-from estimator.rigs.rig import Channel, Rig
+from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.array_types import FloatArray
 

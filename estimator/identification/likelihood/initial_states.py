@@ -14,8 +14,6 @@ import numpy as np
 
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
 from estimator.identification.likelihood.identification_problem import IdentificationProblem
-from estimator.inference.fisher_information import filter_records
-from estimator.identification.likelihood.laplace_fit import FitHypothesis
 from estimator.inference.record_filter import filter_records
 from estimator.support.array_types import FloatArray
 
