@@ -65,8 +65,8 @@ def test_the_drift_is_eq_1_to_far_below_the_noise():
             force = last_u[j] + (u[j] - last_u[j]) * t / SILVERBOX_SAMPLING_STEP
             return [state[1], (force - twin.c * state[1] - twin.a * state[0] - twin.b * state[0] ** 3) / twin.m]
 
-        start = [x[j], v[j] / SAMPLING_STEP]
-        exact = solve_ivp(slope, (0, SAMPLING_STEP), start, rtol=1e-12, atol=1e-12).y[:, -1]
+        start = [x[j], v[j] / SILVERBOX_SAMPLING_STEP]
+        exact = solve_ivp(slope, (0, SILVERBOX_SAMPLING_STEP), start, rtol=1e-12, atol=1e-12).y[:, -1]
         # The smallest noise of docs/evidence/continuous.md moves x by 1e-4 V and x' by 1.7e-4 V per sample.
         assert by_row[PLACE["X_x"], j] == pytest.approx(exact[0], abs=1e-6)
         assert by_row[PLACE["X_v"], j] == pytest.approx(exact[1] * SILVERBOX_SAMPLING_STEP, abs=4e-6)
