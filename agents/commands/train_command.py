@@ -105,7 +105,8 @@ class TrainCommand(TrainConfig):
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the usual policies."""
         if config.env == FAMILY:
-            print_wrapped(f"python -m agents.studies.family --policies {policy}")
+            module = "research.studies.unseen_oscillators"
+            print_wrapped(f"From a checkout of the repository: python -m {module} --policies {policy}")
         elif self.systems:
             from agents.evaluation.comparison import compare_policies, default_policies
 

@@ -66,9 +66,9 @@ class TrackSystems:
             )
         plant = plant_model_of(experiment, envs.truth)
         precision = np.linalg.inv(plant.prior.coefficients_cov).astype(np.float64)
-        noise_variances = noise_variances(plant.model, plant.process_noise, plant.sensor_noises)
-        noise_variances = np.broadcast_to(noise_variances, (n_systems, noise_variances.shape[-1])).copy()
-        return cls(experiment, plant.coefficients_of(envs.truth), precision, noise_variances)
+        variances = noise_variances(plant.model, plant.process_noise, plant.sensor_noises)
+        variances = np.broadcast_to(variances, (n_systems, variances.shape[-1])).copy()
+        return cls(experiment, plant.coefficients_of(envs.truth), precision, variances)
 
     def rows(self, first: int, stop: int) -> TrackSystems:
         """Some of them."""
@@ -182,8 +182,10 @@ class Oracle:
         """
         path = systems.path
         if not path.is_file():
-            command = "python -m research.oracles.oracle_search --env ..."
-            raise FileNotFoundError(f"no oracle is stored for {systems.description}; run {command}")
+            raise FileNotFoundError(
+                f"no oracle is stored for {systems.description}; from a checkout of the repository, run "
+                "python -m research.oracles.oracle_search --env ..."
+            )
         with np.load(path, allow_pickle=False) as stored:
             scaled, theta, bounds = stored["inputs"], stored["theta"], stored["bounds"]
             task = str(stored["task"])
@@ -202,7 +204,7 @@ class Oracle:
         with np.load(systems.path, allow_pickle=False) as stored:
             return len(stored["theta"])
 
-    def first(self, count: int) -> Oracle:
+    def head(self, count: int) -> Oracle:
         """That of the first systems."""
         return Oracle(self.systems.rows(0, count), self.inputs[:count], self.values[:count], self.bounds[:count])
 

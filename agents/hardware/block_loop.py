@@ -16,7 +16,8 @@ from agents.hardware.env_view import EnvView
 from agents.hardware.recording import Recording
 from agents.hardware.run_estimator import RunEstimator
 from agents.hardware.safety_session import SafetyStop, Session
-from agents.planning.open_loop.chance_constrained_block import initial_guesses, optimise_block, sampled_systems
+from agents.planning.open_loop.chance_constrained_block import optimise_block, sampled_systems
+from agents.planning.open_loop.initial_guesses import initial_guesses
 from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import Policy
 from agents.policies.efe_planner import EfePlanner
@@ -62,7 +63,7 @@ class PlannedBlockDesigner:
         """The best block; it is planned as if it were the last."""
         planner, belief = self._planner, self._env_view.belief
         systems = sampled_systems(planner.model_view, belief, futures, samples)
-        starting_inputs = initial_guesses(planner, belief.record, samples, int(self._rng.integers(2**63)))
+        starting_inputs = initial_guesses(planner.settings, belief.record, samples, int(self._rng.integers(2**63)))
         return optimise_block(planner.model_view, systems, futures, starting_inputs, planner.objective.amplitude, bound)
 
 

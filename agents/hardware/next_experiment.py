@@ -16,11 +16,11 @@ from agents.planning.model_probe import ModelView, believed_resonance
 from agents.planning.open_loop.chance_constrained_block import (
     MAX_PLANNED_DRAWS,
     expected_information,
-    initial_guesses,
     optimise_block,
     sampled_systems,
 )
 from agents.planning.open_loop.expected_d_optimality import SampledSystems
+from agents.planning.open_loop.initial_guesses import initial_guesses
 from agents.planning.open_loop.posterior_samples import MonteCarloSystems, draw_at_rest, equilibria, required_draws
 from agents.policies import make_policy
 from agents.policies.efe_planner import EfePlanner
@@ -155,7 +155,7 @@ def design_experiment(
     if isinstance(policy_object, EfePlanner):
         n_noise_starts = min(max(_NOISE_START_SAMPLES // int(samples), _MIN_NOISE_STARTS), _MAX_NOISE_STARTS)
         starting_inputs = initial_guesses(
-            policy_object, _belief_record_at_rest(belief), int(samples), seed, n_noise_starts
+            policy_object.settings, _belief_record_at_rest(belief), int(samples), seed, n_noise_starts
         )
         u, scale, probability = optimise_block(
             view, systems, futures, starting_inputs, env_view.max_input, bound, tell=on_progress

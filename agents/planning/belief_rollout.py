@@ -124,10 +124,10 @@ class BeliefRollout(NamedTuple):
 
     Attributes:
         size: numbers in a block.
-        kept: of these, from the first on, that stand for a plan between two samples.
+        n_carried: of these, from the first on, that stand for a plan between two samples.
         input_row: where the row of the newest input begins; before a sample, the input to apply.
         score_row: where the row of the scores begins.
-        margin: where the row begins of what an output should keep from the limit.
+        margin_row: where the row begins of what an output should keep from the limit.
         margin_excess: where the row begins of how many standard deviations it is within that; 0 where the margin is firm.
         variance_row: where the row begins of the predictive variance of what the first sensor shows.
         noise_index: where a record has the shape of the first sensor's precision; its rate is the next number.
@@ -141,10 +141,10 @@ class BeliefRollout(NamedTuple):
     """
 
     size: int
-    kept: int
+    n_carried: int
     input_row: int
     score_row: int
-    margin: int
+    margin_row: int
     margin_excess: int
     variance_row: int
     noise_index: int
@@ -156,20 +156,23 @@ class BeliefRollout(NamedTuple):
 
 
 def _stage_cost(
-    INPUT, SHOWN, SPREAD, SURPRISE, COST, noise, shaken, limit, margin, firm, price, goal, goal_weight, amplitude, reach
+    INPUT, SHOWN, SPREAD, SURPRISE, COST, sensor_variance, accumulated_noise, limit, margin, hard_margin, input_weight, goal,
+    goal_weight, amplitude, recoverable_step,
 ):  # fmt: skip
     """What has been charged after a sample, its margin, and how near it leads; ``noise_index`` is the sensor's variance."""
-    deviation = np.sqrt(SPREAD + max(SURPRISE, shaken))
+    deviation = np.sqrt(SPREAD + max(SURPRISE, accumulated_noise))
     # What the output before tells is made up for by braking harder than planned, where there is harder.
-    recoverable = abs(reach) * amplitude + (reach * INPUT if SHOWN > 0.0 else -reach * INPUT)
+    recoverable = abs(recoverable_step) * amplitude + (
+        recoverable_step * INPUT if SHOWN > 0.0 else -recoverable_step * INPUT
+    )
     margin_width = min(max(margin * np.sqrt(SPREAD), margin * deviation - recoverable), MAX_MARGIN_FRACTION * limit)
-    near = (1.0 - firm) * (abs(SHOWN) + margin_width - limit) / deviation
-    over = abs(SHOWN) + firm * margin_width - limit
+    near = (1.0 - hard_margin) * (abs(SHOWN) + margin_width - limit) / deviation
+    over = abs(SHOWN) + hard_margin * margin_width - limit
     over, square = (over if over > 0.0 else 0.0), (near * near if near > 0.0 else 0.0)
     goal_error = SHOWN - goal
     limit_cost = COST + _VIOLATION_COST / limit * over + MARGIN_COST * square * square
     return (
-        limit_cost + price * INPUT * INPUT + goal_weight * (goal_error * goal_error + SPREAD - noise),
+        limit_cost + input_weight * INPUT * INPUT + goal_weight * (goal_error * goal_error + SPREAD - sensor_variance),
         margin_width,
         near,
     )
@@ -200,7 +203,7 @@ def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> Belie
     covariance = place[f"P_{first}_{first}"] * LANES
     noise_index = names.index("GAMMA_SHAPE") + 2
     advance_belief, judge = expected_update.advance, expected_update.final_information
-    uniform = "noise shaken limit margin firm price goal goal_weight amplitude reach"
+    uniform = "sensor_variance accumulated_noise limit margin hard_margin input_weight goal goal_weight amplitude recoverable_step"
     stage_cost = lanewise(place, "COST MARGIN NEAR", uniform=uniform)(_stage_cost)
     net_information = lanewise(place, "SCORE")(_net_information)
     compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")

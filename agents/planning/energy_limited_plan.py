@@ -55,14 +55,14 @@ class EnergyLimitedPlan(NamedTuple):
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.
             - ``rng_state`` (n, 4): streams of random numbers; overwritten.
             - ``actions`` (n,) receives the first input of each plan.
-        begin: ``start_from_belief(record, precision, start)``: of a belief the inverse (K, K) of the coefficients' covariance, and
+        start_from_belief: ``start_from_belief(record, precision, start)``: of a belief the inverse (K, K) of the coefficients' covariance, and
             the rows of a path's start (`agents.planning.d_optimality`); the older inputs in it are left as they are.
         resonant_bursts: ``resonant_bursts(nominal, limit, energy, inputs, rng_state)``: fill inputs (k, T) with bursts from rest, which push as
             the system moves.
     """
 
     plan_rest_of_episode: Any
-    begin: Any
+    start_from_belief: Any
     resonant_bursts: Any
 
 

@@ -121,12 +121,12 @@ class SearchProblem(NamedTuple):
 def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> GridBeamSearch:
     """The ways through the map of a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
     rollout = compile_belief_rollout(model, degree, lag)
-    size, n_carried, U, SCORE = rollout.size, rollout.kept, rollout.input_row, rollout.score_row
+    size, n_carried, U, SCORE = rollout.size, rollout.n_carried, rollout.input_row, rollout.score_row
     load_belief, advance, evaluate = rollout.load_belief, rollout.advance, rollout.evaluate
     states = {"FIRST": 0, "SECOND": 1, "CELL": compile_expected_update(model, degree, lag).layout["CELL"]}
     CELL = states["CELL"] * LANES
-    in_line = lanewise(states, "CELL", uniform="sign right cells scale")(_cell_on_line)
-    in_plane = lanewise(states, "CELL", uniform="sign right up cells scale other")(_cell_in_plane)
+    in_line = lanewise(states, "CELL", uniform="mirror_sign offset_x cells scale")(_cell_on_line)
+    in_plane = lanewise(states, "CELL", uniform="mirror_sign offset_x offset_y cells scale scale_y")(_cell_in_plane)
     is_plane = model.n_states > 1
     compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
 
@@ -284,11 +284,13 @@ def _axis_cell(x, scale, cells, offset):
     return math.floor(min(position, cells - 1.0)) if position > 0.0 else 0.0
 
 
-def _cell_on_line(FIRST, sign, right, cells, scale):
+def _cell_on_line(FIRST, mirror_sign, offset_x, cells, scale):
     """The cell of a state of one number."""
-    return _axis_cell(sign * FIRST, scale, cells, right)
+    return _axis_cell(mirror_sign * FIRST, scale, cells, offset_x)
 
 
-def _cell_in_plane(FIRST, SECOND, sign, right, up, cells, scale, other):
+def _cell_in_plane(FIRST, SECOND, mirror_sign, offset_x, offset_y, cells, scale, scale_y):
     """The cell of a state, of which the first two numbers count."""
-    return _axis_cell(sign * FIRST, scale, cells, right) * cells + _axis_cell(sign * SECOND, other, cells, up)
+    return _axis_cell(mirror_sign * FIRST, scale, cells, offset_x) * cells + _axis_cell(
+        mirror_sign * SECOND, scale_y, cells, offset_y
+    )

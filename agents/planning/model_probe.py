@@ -46,7 +46,7 @@ class ModelView(NamedTuple):
         return cls(model, 0, int(experiment.truth_model.is_continuous and experiment.degree == 1))
 
     @property
-    def kind(self) -> str:
+    def compile_key(self) -> str:
         """What tells the functions compiled for it from those for others (`estimator.compilation.simd.jit_closure`)."""
         return f"{self.model.name}_{self.model.digest}_{self.degree}_{self.lag}"
 
@@ -124,7 +124,7 @@ def _compile_local_dynamics(model: Model) -> Any:
     linear, first = at[f"A_{state}_{state}"], at[f"E_{coefficient}"]
 
     @kernel(variant=f"{model.name}_{model.digest}")
-    def survey(means, states, inputs, found):
+    def local_dynamics_kernel(means, states, inputs, found):
         W = np.zeros(size)
         for i in range(len(means)):
             copy(W, 0, states[i], n)
@@ -139,7 +139,7 @@ def _compile_local_dynamics(model: Model) -> Any:
                     found.jacobians[i, a, b] = W[linear + a * n + b]
             copy(found.regressors[i], 0, W[first:], k)
 
-    return survey
+    return local_dynamics_kernel
 
 
 def local_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> LocalDynamics:
@@ -264,7 +264,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)
     velocity = at[rate] if rate in states else velocity
 
-    @kernel(variant=view.kind)
+    @kernel(variant=view.compile_key)
     def swing(means, max_input, limit, peaks, mean_information):
         W = np.zeros(size)
         copy(W, n, means, k)

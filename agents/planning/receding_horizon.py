@@ -22,11 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planning.belief_rollout import compile_belief_rollout, objective_at
+from agents.planning.belief_rollout import PlanObjective, compile_belief_rollout, objective_at
 from agents.planning.candidate_inputs import hold_samples_for, limit_slew, mutate_plan, shift_plan
 from agents.planning.d_optimality import factorise_information
 from agents.planning.discount import discount_weight_drop, fill_discount_weights, filter_delay_in_moves
 from agents.planning.grid_beam_search import SearchProblem, compile_grid_beam_search
+from agents.planning.model_probe import ModelView
 from agents.planning.newton_steps import empty_candidate_batch, fill_finite_differences, fill_newton_candidates
 from estimator.compilation.array_operations import copy, fill, index_of_max
 from estimator.compilation.simd import LANES, jit, jit_closure, kernel
@@ -63,6 +64,22 @@ _MIN_PLAN_DISTANCE, _N_MOVES_COMPARED = 0.3, 20
 #: Part of what a plan teaches per sample that goes into the running mean; and of how many of its last moves. Before
 #: them a swing may still have to be built.
 _RATE_UPDATE_FRACTION, _N_RATE_MOVES = 0.05, 25
+
+
+class PlanSettings(NamedTuple):
+    """The settings of a planner.
+
+    Attributes:
+        model_view: how the model is taken.
+        objective: of plans, for a whole episode.
+        horizon: moves of a plan, at most.
+        rounds: of improvement of each plan, at most.
+    """
+
+    model_view: ModelView
+    objective: PlanObjective
+    horizon: int
+    rounds: int
 
 
 class RecedingHorizon(NamedTuple):

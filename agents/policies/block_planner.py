@@ -14,10 +14,10 @@ from scipy.special import ndtri
 from agents.planning.model_probe import observation_layout
 from agents.planning.open_loop.chance_constrained_block import (
     MAX_PLANNED_DRAWS,
-    initial_guesses,
     optimise_block,
     sampled_systems,
 )
+from agents.planning.open_loop.initial_guesses import initial_guesses
 from agents.planning.open_loop.posterior_samples import (
     MonteCarloSystems,
     draw_from_records,
@@ -148,7 +148,7 @@ class BlockPlanner:
         monte_carlo = MonteCarloSystems(view.model, draws, self._limit, rng, degree=view.degree)
         systems = sampled_systems(view, belief, monte_carlo, n_planned, previous_input)
         u, *_ = optimise_block(
-            view, systems, monte_carlo, initial_guesses(planner, record, n_planned, int(rng.integers(2**63))), objective.amplitude, max_probability,
+            view, systems, monte_carlo, initial_guesses(planner.settings, record, n_planned, int(rng.integers(2**63))), objective.amplitude, max_probability,
             min(n_planned, samples + _SAFE_LOOKAHEAD_MOVES * objective.hold_samples),
         )  # fmt: skip
         return np.concatenate([u[:samples], np.zeros(self.block - samples)])

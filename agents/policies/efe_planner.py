@@ -58,7 +58,7 @@ from agents.planning.model_probe import (
     probe_time_scales,
     recoverable_step,
 )
-from agents.planning.receding_horizon import compile_receding_horizon
+from agents.planning.receding_horizon import PlanSettings, compile_receding_horizon
 from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
 from estimator.engine.noise_free_response import with_coarse_substeps
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
@@ -221,6 +221,11 @@ class EfePlanner:
                 )
             ),
         )
+
+    @property
+    def settings(self) -> PlanSettings:
+        """The settings of the search, for `agents.planning.open_loop.initial_guesses`."""
+        return PlanSettings(self.model_view, self.objective, self.horizon, self.rounds)
 
     def predict(
         self,

@@ -107,8 +107,8 @@ class TrainConfig(TrainingSubject):
             check_track_id(self.env)
         elif self.options or self.eval_every or self.algo != "ppo":
             raise ValueError(
-                f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare with "
-                "python -m research.studies.unseen_oscillators"
+                f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare from "
+                "a checkout of the repository, with python -m research.studies.unseen_oscillators"
             )
         if self.hyperparameters is None:
             object.__setattr__(self, "hyperparameters", read_hyperparameters(self.algo, self.env, self.settings))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agents.hardware.run_settings import RunSettings
 from agents.policies.networks.policy_saving import save_policy
 from agents.policies.signal_export import draw_signal
-from agents.studies.datasets import Config as Dataset
+from agents.datasets import Config as Dataset
 from agents.training.training_config import TrainConfig
 from benchmarks.fuzz.bad_values import anything, changed, options
 from benchmarks.fuzz.call_verdicts import Call

@@ -156,7 +156,7 @@ class Certificate:
         return u, x
 
     def bound(self, multipliers: BoundMultipliers, grid: StateGrid, layers: int = 2) -> tuple[float, FloatArray]:
-        """The bound [nats], and the values of the programme (`StateGrid.values`)."""
+        """The bound [nats], and the values of the programme (`StateGrid.solve`)."""
         now, last, second, third = grid.nodes
         root = np.linalg.cholesky(multipliers.G)
         W = multipliers.W @ root
@@ -170,7 +170,7 @@ class Certificate:
         for k in range(4):
             costs += (wanted[:, :, None, None, :, k] + carried[..., None, k]) ** 2 / self.q
         costs += ((next_v**2).sum(axis=-1) / self.r)[:, :, None, None]
-        V = grid.values(costs, self.samples, layers)
+        V = grid.solve(costs, self.samples, layers)
         most = V[0, grid.n // 2, grid.n // 2, grid.levels // 2, grid.levels // 2, -1]
         return self._at_most(multipliers, most), V
 

@@ -110,7 +110,7 @@ def _parabola_gain(low, middle, high, x, m):
 
 @kernel
 def solve_backward(costs, low, share, level, parts, spent, held, samples, V):
-    """Fill the layers of V, the last one first; see `research.oracles.state_grid.StateGrid.values`."""
+    """Fill the layers of V, the last one first; see `research.oracles.state_grid.StateGrid.solve`."""
     n, levels, actions, energies = costs.shape[0], costs.shape[2], costs.shape[4], V.shape[5]
     line, later, best = np.empty(energies), np.empty((actions, energies)), np.empty(energies)
     chosen, at = np.empty(energies, dtype=np.int64), np.zeros((actions, energies), dtype=np.int64)

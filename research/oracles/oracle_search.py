@@ -8,7 +8,7 @@ is the Fisher information at the true coefficients along the response without no
 covariance of the coefficients. What is stored is a start. A search ends after so many starts, but goes on, to eight
 times as many, until three that began anew have come to the highest summit.
 
-With `--compare_with_stored` nothing is stored: a search from fresh starts, twice as long, says for each system what it gains over
+With `--check` nothing is stored: a search from fresh starts, twice as long, says for each system what it gains over
 what is stored, and by how much its best three starts differ.
 
 System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.policy_evaluation.evaluate_policies`
@@ -218,7 +218,7 @@ def main(config: Config) -> None:
         if value > oracle.values[row]:
             oracle.inputs[row], oracle.values[row] = found, value
         if row + 1 == config.systems or row % 8 == 7:  # a search that is cut short leaves what it found
-            path = oracle.first(int(np.isfinite(oracle.values).sum())).save()
+            path = oracle.head(int(np.isfinite(oracle.values).sum())).save()
     gained = oracle.values - 0.5 * np.linalg.slogdet(oracle.systems.precision)[1]
     seconds = time.perf_counter() - began
     print_texts_and_tables(

@@ -138,7 +138,7 @@ class StateGrid:
         (smooth, _, whole), (rough, weight, _) = weighed(4), weighed(2)
         return np.where(whole, smooth, np.where(weight > 1e-9, rough / np.maximum(weight, 1e-9), -1e12))
 
-    def values(self, costs: FloatArray, samples: int, layers: int) -> FloatArray:
+    def solve(self, costs: FloatArray, samples: int, layers: int) -> FloatArray:
         """The most that costs add up to from every node on.
 
         Args:

@@ -152,7 +152,7 @@ def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, V
 
 
 def compile_kernels(record: SilverboxRecord, data: Path | None) -> None:
-    """Compiles what `run` trains with, so that its seconds do not count that.
+    """Compiles what `train_and_validate` trains with, so that its seconds do not count that.
 
     Numba compiles anew for the record's arrays, which are read-only, and for the delayed copies of them.
     """

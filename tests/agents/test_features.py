@@ -20,7 +20,7 @@ from agents.policies.networks.rollout_features import FEATURE_NAMES, MAX_FEATURE
 from estimator.engine.noise_free_response import compile_noise_free_response
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
-REACHES = [FEATURE_NAMES.index(f"reach_{first}") for first in ("down", "none", "up")]
+REACHES = [FEATURE_NAMES.index(f"braked_peak_with_margin_{first}") for first in ("down", "none", "up")]
 STATE = ENTRIES.index("state_x1")
 
 #: An environment of each model and of what changes its setting.
@@ -216,7 +216,10 @@ def test_a_damaged_setting_is_refused():
     cases = [(whole[:-1], "numbers, but is"), (put(0, np.nan), "center of setting must be positive")]
     cases += [(put(9, np.inf), "of setting must be positive and finite")]
     cases += [(put(4, -1.0), "std of setting"), (put(at["samples"], 0.0), "samples of setting")]
-    cases += [(put(at["pace"], 1e6), "pace of setting"), (put(at["energy"], np.nan), "energy of setting")]
+    cases += [
+        (put(at["hold_samples"], 1e6), "hold_samples of setting"),
+        (put(at["energy"], np.nan), "energy of setting"),
+    ]
     assert_refused([(lambda t=tensor: FeatureEncoder.from_tensor(t, description), part) for tensor, part in cases])
 
 
@@ -240,7 +243,7 @@ def test_it_takes_the_prior_and_the_limits_of_the_environment():
     options = {"horizon": 90, "max_input": 0.05, "max_output": 0.2, "spread": 0.2, "process_noise": 1e-3}
     usual, other = (FeatureEncoder.of(make_track_batch(AMPLITUDE, 1, o)).setting for o in ({}, options))
     assert (other.samples, other.max_input, other.limit, other.energy) == (90, 0.05, 0.2, np.inf)
-    assert (usual.process, other.process) == pytest.approx((2.5e-7, 1e-6))
+    assert (usual.process_variance, other.process_variance) == pytest.approx((2.5e-7, 1e-6))
     assert (other.std < usual.std).all()
     np.testing.assert_array_equal(other.scales, 0.2)
     limited = FeatureEncoder.of(make_track_batch(POWER, 1, {"max_rms": 0.01, "horizon": 100})).setting

@@ -80,7 +80,9 @@ def test_a_block_is_planned_for_a_model_of_two_sensors(monkeypatch):
         asked.append((systems, futures, candidates, amplitude, bound, played))
         return candidates[0], 1.0, 0.0
 
-    monkeypatch.setattr(block_planner, "drafts", lambda planner, record, samples, seed: np.full((1, samples), 0.3))
+    monkeypatch.setattr(
+        block_planner, "initial_guesses", lambda settings, record, samples, seed: np.full((1, samples), 0.3)
+    )
     monkeypatch.setattr(block_planner, "optimise_block", best_block)
     policy, plan, state = BlockPlanner(env, block=8), [], None
     for _ in range(9):

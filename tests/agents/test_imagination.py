@@ -230,7 +230,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     belief = random_belief(model, np.random.default_rng(2))
     found = compile_d_optimality(model)
     precision, start = np.empty((4, 4)), np.zeros(found.start_size)
-    compile_energy_limited_plan(model).begin(belief.record.copy(), precision, start)
+    compile_energy_limited_plan(model).start_from_belief(belief.record.copy(), precision, start)
     known = NominalSystem(belief.coefficients_mean, precision, (0.01**2, 0.02**2))
     u = np.random.default_rng(3).normal(0.0, 0.05, 8)
     value, _ = found.criterion(known, 1e3, 0.0, start, u, found.workspace(8))
@@ -278,7 +278,7 @@ def test_few_steps_are_enough_to_plan_with():
     found.evaluate(W.reshape(-1), np.zeros((4, 4)), 1.0)
     exact, precision = compile_d_optimality(fine), np.empty((4, 4))
     start, (shape, rate, xi_shape, xi_rate) = np.zeros(exact.start_size), belief.record[-4:]
-    compile_energy_limited_plan(fine).begin(belief.record.copy(), precision, start)
+    compile_energy_limited_plan(fine).start_from_belief(belief.record.copy(), precision, start)
     known = NominalSystem(belief.coefficients_mean, precision, (rate / shape, xi_rate / xi_shape))
     nats = [exact.criterion(known, 1e3, 0.0, start, u[:, j].copy(), exact.workspace(24))[0] for j in range(LANES)]
     errors = W[compile_expected_update(duffing(), 0).layout["SCORE"]] - nats

@@ -30,7 +30,7 @@ def gains(systems, values):
 
 def test_an_oracle_of_another_task_is_refused(tmp_path, monkeypatch):
     ours, others = TrackSystems.of(POWER, 2), TrackSystems.of("duffing_env/Amplitude-v0", 2).path
-    monkeypatch.setattr(module_of_oracle, "FOLDER", tmp_path)
+    monkeypatch.setattr(module_of_oracle, "ORACLE_FOLDER", tmp_path)
     shutil.copy(others, ours.path)
     with pytest.raises(ValueError, match=r"oracle must be for the systems at hand, but .*npz is not; make it anew"):
         Oracle.of(ours)

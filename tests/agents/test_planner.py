@@ -163,18 +163,18 @@ def test_the_next_best_plan_is_another_one_and_is_followed_where_it_is_the_best(
     def gap(plans, others):
         return np.abs(plans - others)[:, 1:20].max(axis=1) / envs.max_input
 
-    there = state.others.any(axis=1)
+    there = state.runner_ups.any(axis=1)
     assert there.mean() > 0.9
-    assert (np.abs(state.plans - state.others)[there, :20].max(axis=1) > 0.3 * envs.max_input).all()
+    assert (np.abs(state.plans - state.runner_ups)[there, :20].max(axis=1) > 0.3 * envs.max_input).all()
 
     def followed(**changed):
         _, after = planner.predict(observations, state._replace(**changed), start)
         return (gap(after.plans, np.roll(state.plans, -1, axis=1)) < 0.3).mean()
 
     none = np.zeros_like(state.plans)
-    anew = followed(plans=none, others=none)
-    assert followed(plans=none, others=state.plans) > anew + 0.15
-    assert followed(plans=state.others, others=state.plans) > anew + 0.15
+    anew = followed(plans=none, runner_ups=none)
+    assert followed(plans=none, runner_ups=state.plans) > anew + 0.15
+    assert followed(plans=state.runner_ups, runner_ups=state.plans) > anew + 0.15
 
 
 def test_the_seed_is_that_of_the_search():
@@ -483,7 +483,7 @@ def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves
     for i, plan in enumerate(state.plans):
         known = precisions(envs.belief(i), plan[:moves])
         counted = min(25, moves)
-        np.testing.assert_allclose(state.rates[i], (known[-1] - known[-1 - counted]) / counted, rtol=1e-6)
+        np.testing.assert_allclose(state.information_rates[i], (known[-1] - known[-1 - counted]) / counted, rtol=1e-6)
 
 
 def test_what_moves_teach_counts_the_less_the_later():
@@ -548,7 +548,7 @@ def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
 
     monkeypatch.setattr(block_planner, "optimise_block", best_block)
     for halvings in (0, chance_constrained_block._N_BISECTIONS):
-        monkeypatch.setattr(chance_constrained_block, "_HALVINGS", halvings)
+        monkeypatch.setattr(chance_constrained_block, "_N_BISECTIONS", halvings)
         BlockPlanner(env, block=24, risk=0.1).predict(observation)
     never, often = told.values()
     assert often > never + 0.02

@@ -75,9 +75,9 @@ def features(observation, s: FeatureSettings):
         thrift = min(1.0, reserve / np.sqrt(left))
         height = np.abs(roll(theta, x, before, lambda t, velocity: 0.0, limit)[0]).max() / limit
         push = min(1.0, max(thrift, s.amplitude_growth * height / s.step_response))
-    process, sensor = s.process * np.exp(-o["log_gamma"]), s.sensor * np.exp(-o["log_xi_y"])
+    process, sensor = s.process_variance * np.exp(-o["log_gamma"]), s.sensor_variance * np.exp(-o["log_xi_y"])
     variance = process + sensor
-    J = share / variance * s.rate
+    J = share / variance * s.information_rate
     W = np.linalg.inv(np.linalg.inv(C) + J)
     to_come = 0.5 * np.linalg.slogdet(np.eye(4) + C @ J)[1]
     noise = variance * np.array([1.0, 2.0, 2.0, 2.0, 2.0]) + s.accumulated_noise * process * np.array(
@@ -114,5 +114,5 @@ def features(observation, s: FeatureSettings):
     values = [np.mean(log_stds), max(log_stds), o["log_gamma"], o["log_xi_y"], o["time_left"], thrift, reserve, push]
     values += [sign * o["last_input"], sign * o["last_y"], x / limit, (x - before) / limit]
     values += [0.5 * np.log(variance / limit**2) + 7, low, high, *np.concatenate(list(found.values())), *free]
-    values += [to_come / 4, np.log(np.trace(W @ s.rate) / (2 * variance) * s.samples + 1e-6)]
+    values += [to_come / 4, np.log(np.trace(W @ s.information_rate) / (2 * variance) * s.samples + 1e-6)]
     return np.clip(values, -MAX_FEATURE, MAX_FEATURE), sign, (low, high), push, to_come

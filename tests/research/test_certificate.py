@@ -43,8 +43,8 @@ def test_the_programme_is_the_plain_recursion(energies):
             for b in range(3):
                 here[i, j, a, b, k] = highest(costs[i, j, a, b] + later, held, energies > 1)
         after = here
-    np.testing.assert_allclose(grid.values(costs, 4, 2)[0], after, rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(grid.values(costs, 4, 5)[0], grid.values(costs, 4, 2)[0])
+    np.testing.assert_allclose(grid.solve(costs, 4, 2)[0], after, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(grid.solve(costs, 4, 5)[0], grid.solve(costs, 4, 2)[0])
     assert np.isneginf(after).any()
     assert np.isfinite(after).any()
 

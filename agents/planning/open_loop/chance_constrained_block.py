@@ -14,7 +14,6 @@ for the belief's means; the best of what is safe is taken.
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from threading import Lock
@@ -27,8 +26,6 @@ from agents.planning.model_probe import ModelView
 from agents.planning.open_loop.expected_d_optimality import SampledSystems, compile_expected_d_optimality
 from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.planning.projected_gradient import DesignLimits, project_input
-from agents.planning.receding_horizon import compile_receding_horizon
-from agents.policies.efe_planner import EfePlanner
 from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel
@@ -64,9 +61,6 @@ MAX_PLANNED_DRAWS = N_SYSTEMS + _MAX_TIGHTENINGS * _N_SYSTEMS_ADDED
 
 #: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
 _EXCESS_PENALTY = 3e4
-
-#: The second candidate in parts of the first, and the standard deviation of candidates of noise in parts of the limit.
-_WEAKER_PLAN_FRACTION, _NOISE_STD_FRACTION = 0.6, 0.3
 
 
 def sampled_systems(
@@ -226,28 +220,6 @@ def _climb_candidate(
         u = ascended(u, soft_limit, _N_STEPS_AFTER_TIGHTENING)
     share, probability = monte_carlo.safe_scale(u[:n_safe_samples], max_probability)
     return share * u, share, probability
-
-
-def initial_guesses(
-    planner: EfePlanner, record: FloatArray, n_samples: int, seed: int, n_noise_guesses: int = 2
-) -> FloatArray:
-    """(2 + noises, samples) to begin from: the planner's plan, were the belief's means true, a weaker one, and noise.
-
-    The plan's margin is the least of an episode's, and no output is answered: the limits that a block must keep are
-    `optimise_block`'s.
-    """
-    plan = np.zeros(n_samples)
-    objective = planner.objective._replace(margin=float(np.min(planner.objective.margin)), recoverable_step=0.0)
-    rng_state = np.random.SFC64(seed).state["state"]["state"]
-    horizon = min(planner.horizon, n_samples)
-    compile_receding_horizon(*planner.model_view).plan_known_system(
-        record.copy(), 0, horizon, planner.rounds, objective, plan, rng_state
-    )
-    moves = np.random.default_rng(seed).standard_normal(
-        (n_noise_guesses, math.ceil(n_samples / objective.hold_samples))
-    )
-    noise = _NOISE_STD_FRACTION * objective.amplitude * np.repeat(moves, objective.hold_samples, axis=1)[:, :n_samples]
-    return np.clip(np.stack([plan, _WEAKER_PLAN_FRACTION * plan, *noise]), -objective.amplitude, objective.amplitude)
 
 
 def expected_information(

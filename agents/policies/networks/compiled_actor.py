@@ -143,7 +143,7 @@ def compile_decision(view: ModelView) -> Any:
     """
     workspace, encode = compile_features(view)
 
-    @kernel(variant=view.kind)
+    @kernel(variant=view.compile_key)
     def decide(observations, setting, with_observation, actor, actions):
         buffers, values, allowed_interval = workspace(), np.empty(actor.sizes[0], np.float32), np.empty(2, np.float32)
         x = np.empty(actor.sizes.sum(), np.float32)

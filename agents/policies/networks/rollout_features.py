@@ -43,15 +43,20 @@ from estimator.support.array_types import FloatArray
 
 FIRST_INPUTS = ("up", "none", "down")
 
+#: Features that stand for each of the first inputs.
+_PER_FIRST_INPUT = (
+    "next_output", "free_peak", "braked_peak", "braked_peak_with_margin", "free_information", "braked_information",
+)  # fmt: skip
+
 #: What every network sees. ``next``: what the first sensor shows after a move; ``rest`` and ``peak``: the highest that
 #: it shows at rest and braking; ``peak_with_margin``: the highest while braking, with its margin. ``mean_information`` and ``braked``
 #: compare what three moves teach at rest and braking: ``up`` is up less down, and ``none`` is none less the better of
 #: both, in parts of the most; ``down`` is the logarithm of the most over the samples left.
 FEATURE_NAMES = (
-    "log_std_mean", "log_std_max", "log_gamma", "log_xi", "time_left", "thrift", "reserve", "push",
-    "last_input", "last_output", "now", "velocity", "log_deviation", "lowest", "highest",
-    *(f"{what}_{first}" for what in ("next", "rest", "peak", "reach", "taught", "braked") for first in FIRST_INPUTS),
-    "free_2", "free_3", "free_4", "to_come", "still_open",
+    "log_std_mean", "log_std_max", "log_gamma", "log_xi", "time_left", "energy_left_ratio", "energy_left", "action_scale",
+    "last_input", "last_output", "output", "velocity", "log_deviation", "lowest_allowed", "highest_allowed",
+    *(f"{what}_{first}" for what in _PER_FIRST_INPUT for first in FIRST_INPUTS),
+    "free_response_2", "free_response_3", "free_response_4", "remaining_information", "open_information_rate",
 )  # fmt: skip
 
 #: Largest size of a feature.
@@ -69,10 +74,10 @@ MARGIN_KNOWN_NOISE, MARGIN_UNKNOWN_NOISE = 8.0, 10.0
 AMPLITUDE_GROWTH = 0.15
 
 #: No episode is longer, and no move.
-_MAX_SETTINGS = {"samples": 1e9, "pace": 1e3}
+_MAX_SETTINGS = {"samples": 1e9, "hold_samples": 1e3}
 
 #: Of a setting, what may be 0.
-_MAY_BE_ZERO = ("rate", "process", "sensor", "shaken", "margin")
+_MAY_BE_ZERO = ("information_rate", "process_variance", "sensor_variance", "accumulated_noise", "margin")
 
 #: By how much covariances of float32 correlations are made positive definite.
 _RIDGE = 1e-6
@@ -84,7 +89,7 @@ class FeatureSettings(NamedTuple):
     Attributes:
         center: (K,) prior means of the coefficients.
         std: (K,) their standard deviations.
-        rate: (K, K) information about the coefficients that a sample of a swing at the limit brings, times the variance
+        information_rate: (K, K) information about the coefficients that a sample of a swing at the limit brings, times the variance
             of an output.
         scales: (n,) sizes of the states when the first sensor is at its limit.
         max_input: amplitude limit.
@@ -92,8 +97,8 @@ class FeatureSettings(NamedTuple):
         limit: that the shield keeps.
         samples: of an episode.
         energy: limit of Σ u²; inf where there is none.
-        process: variance that the observation's log E[γ] is relative to.
-        sensor: that of the first sensor's log E[ξ].
+        process_variance: variance that the observation's log E[γ] is relative to.
+        sensor_variance: that of the first sensor's log E[ξ].
         accumulated_noise: variance by which process noise moves the first sensor before anything can be done about it, in parts of
             what it does in a sample.
         hold_samples: samples of a move.
@@ -106,15 +111,15 @@ class FeatureSettings(NamedTuple):
 
     center: FloatArray
     std: FloatArray
-    rate: FloatArray
+    information_rate: FloatArray
     scales: FloatArray
     max_input: float
     max_output: float
     limit: float
     samples: float
     energy: float
-    process: float
-    sensor: float
+    process_variance: float
+    sensor_variance: float
     accumulated_noise: float
     hold_samples: float
     margin: float
@@ -196,11 +201,9 @@ def compile_features(view: ModelView) -> Any:
     )
     entries, n_features = layout.size, len(FEATURE_NAMES)
     place = {name: i for i, name in enumerate(FEATURE_NAMES)}
-    NEXT, REST, PEAK, REACH, TAUGHT, BRAKED = (
-        place[f"{what}_up"] for what in ("next", "rest", "peak", "reach", "taught", "braked")
-    )
-    FREE, OTHERS = place["free_2"], place["to_come"]
-    compile_inner = jit_closure(view.kind)
+    NEXT, REST, PEAK, REACH, TAUGHT, BRAKED = (place[f"{what}_up"] for what in _PER_FIRST_INPUT)
+    FREE, OTHERS = place["free_response_2"], place["remaining_information"]
+    compile_inner = jit_closure(view.compile_key)
 
     @compile_inner
     def workspace():
@@ -319,9 +322,14 @@ def compile_features(view: ModelView) -> Any:
             n_samples_left = 0.5 * (n_samples_left + o[layout.budget_left] * s.samples)
             reserve = np.sqrt(max(0.0, o[layout.budget_left]) * s.energy) / s.max_input
             energy_left_ratio = min(1.0, reserve / np.sqrt(left))
-        process, sensor = s.process * np.exp(-o[layout.noise]), s.sensor * np.exp(-o[layout.noise + 1])
+        process, sensor = (
+            s.process_variance * np.exp(-o[layout.noise]),
+            s.sensor_variance * np.exp(-o[layout.noise + 1]),
+        )
         variance = process + sensor
-        remaining_information = _covariance_at_end(C, s.rate, n_samples_left / variance, final_covariance, scratch)
+        remaining_information = _covariance_at_end(
+            C, s.information_rate, n_samples_left / variance, final_covariance, scratch
+        )
         copy_scaled(final_covariance, 0.5 / variance, final_covariance)
         noise = variance, 2.0 * variance + s.accumulated_noise * process
         roll_out(s, start, W, C, final_covariance, noise, 0.0, False, f, 1)
@@ -352,7 +360,7 @@ def compile_features(view: ModelView) -> Any:
         total = 0.0
         for a in range(k):
             for b in range(k):
-                total += final_covariance[a, b] * s.rate[a, b]
+                total += final_covariance[a, b] * s.information_rate[a, b]
         f[OTHERS + 1] = np.log(total * s.samples + 1e-6)
         if with_observation:
             copy(f, n_features, o, entries)
@@ -372,7 +380,7 @@ def _compile_feature_batch(view: ModelView) -> Any:
     """``encode_batch(observations, setting, own, *features)``: fills in the `ShieldedFeatures` of n observations."""
     workspace, encode = compile_features(view)
 
-    @kernel(variant=view.kind)
+    @kernel(variant=view.compile_key)
     def encode_batch(
         observations,
         setting,
@@ -430,15 +438,15 @@ class FeatureEncoder:
         setting = FeatureSettings(
             center=center,
             std=1.0 / setup.prior_inverse_std,
-            rate=time_scales.mean_information,
+            information_rate=time_scales.mean_information,
             scales=time_scales.scales,
             max_input=float(setup.max_input),
             max_output=float(setup.max_output),
             limit=planning_limit(experiment, time_scales.scales),
             samples=float(setup.horizon),
             energy=float(setup.budget),
-            process=float(np.exp(-setup.prior_log_precisions[0])),
-            sensor=float(np.exp(-setup.prior_log_precisions[1])),
+            process_variance=float(np.exp(-setup.prior_log_precisions[0])),
+            sensor_variance=float(np.exp(-setup.prior_log_precisions[1])),
             accumulated_noise=kept_accumulated_noise(experiment, time_scales),
             hold_samples=float(time_scales.hold_samples),
             margin=MARGIN_KNOWN_NOISE if experiment.noise_hypotheses == 1 else MARGIN_UNKNOWN_NOISE,
@@ -466,7 +474,7 @@ class FeatureEncoder:
         setting = FeatureSettings(center, std, rate.reshape(k, k), scales, *others.tolist())
         value: Any
         for name, value in zip(FeatureSettings._fields, setting, strict=True):
-            to_check = np.diag(value) if name == "rate" else np.asarray(value)
+            to_check = np.diag(value) if name == "information_rate" else np.asarray(value)
             sound = np.isfinite(value).all() or (name == "energy" and value == np.inf)
             sound &= bool(name == "center" or (to_check > 0).all() or (name in _MAY_BE_ZERO and (to_check >= 0).all()))
             if not sound or (name in _MAX_SETTINGS and not 1 <= value <= _MAX_SETTINGS[name]):

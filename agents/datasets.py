@@ -1,7 +1,7 @@
 """Datasets for offline learning, in Minari's format: episodes of policies of four grades on a track.
 
-$ python -m agents.studies.datasets --grade random
-$ python -m agents.studies.datasets --grade expert --env Amplitude-v0 --episodes 5000
+$ python -m agents.datasets --grade random
+$ python -m agents.datasets --grade expert --env Amplitude-v0 --episodes 5000
 
 A dataset is called duffing/TRACK/GRADE-v0, and lies where Minari keeps its own (MINARI_DATASETS_PATH). Its systems are
 of the branch ``train`` of the seeds, so what learns from it has met none of those that it is evaluated on.
