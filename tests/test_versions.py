@@ -156,3 +156,8 @@ def test_extras_are_those_that_are_named_where_a_package_is_missing():
     for package, extra in EXTRA_OF_PACKAGE.items():
         lines = SETTINGS["project"]["optional-dependencies"][extra]
         assert any(line.startswith(package.replace("_", "-")) for line in lines), package
+
+
+def test_highspy_is_the_one_that_research_asks_for():
+    (wanted,) = (line for line in SETTINGS["project"]["optional-dependencies"]["dev"] if line.startswith("highspy"))
+    assert f"pip install '{wanted}'" in (ROOT / "research/oracles/linear_programme.py").read_text()

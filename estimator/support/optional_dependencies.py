@@ -7,7 +7,6 @@ from importlib.util import find_spec
 #: Import name of a package to the extra that installs it.
 EXTRA_OF_PACKAGE = {
     "h5py": "datasets",
-    "highspy": "oracle",
     "matplotlib": "report",
     "minari": "datasets",
     "onnx": "onnx",

@@ -6,6 +6,7 @@ solution starts from the basis of the last, and takes far fewer pivots than from
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,20 @@ from scipy import sparse
 
 from agents.planning.projected_gradient import DesignLimits
 from estimator.support.array_types import FloatArray
-from estimator.support.optional_dependencies import require_packages
+
+_INSTALL_HINT = "highspy is not installed; get it with: pip install 'highspy>=1.10,<1.16'"
+
+
+def import_highspy() -> Any:
+    """The package of HiGHS, which ``make`` installs in a checkout.
+
+    Raises:
+        ModuleNotFoundError: without it, with the command that installs it.
+    """
+    try:
+        return importlib.import_module("highspy")
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(_INSTALL_HINT, name="highspy") from error
 
 
 class LinearProgramme:
@@ -26,14 +40,11 @@ class LinearProgramme:
         limits: to be kept; ``aim`` is the limit of the signal.
 
     Raises:
-        ModuleNotFoundError: without highspy, which the extra ``oracle`` brings.
+        ModuleNotFoundError: as `import_highspy`.
     """
 
     def __init__(self, samples: int, n: int, output_state: int, limits: DesignLimits) -> None:
-        require_packages("highspy")
-        import highspy
-
-        self._highspy = highspy
+        self._highspy = highspy = import_highspy()
         self._solver = highspy.Highs()
         # Presolving costs more than it saves where the last basis is nearly optimal.
         for option, value in (("presolve", "off"), ("solver", "simplex"), ("threads", 1), ("output_flag", False)):

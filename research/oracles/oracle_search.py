@@ -35,7 +35,7 @@ from agents.planning.projected_gradient import DesignLimits, compile_projected_g
 from estimator.belief import Belief
 from estimator.support.argument_checks import MAX_SEED, check_integer
 from estimator.support.array_types import FloatArray
-from estimator.support.optional_dependencies import require_packages
+from research.oracles.linear_programme import import_highspy
 from research.oracles.slp_refinement import refine_input
 
 #: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
@@ -200,7 +200,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Search, store, and say how far it is."""
-    require_packages("highspy")
+    import_highspy()
     systems = TrackSystems.of(config.env, config.systems, config.options)
     began = time.perf_counter()
     if config.check:

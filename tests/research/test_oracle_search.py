@@ -8,7 +8,6 @@ import pytest
 from agents.evaluation import oracle as module_of_oracle
 from agents.evaluation.oracle import Oracle, TrackSystems
 from agents.planning.model_probe import ModelView, probe_time_scales
-from estimator.support.optional_dependencies import install_hint, is_not_installed
 from research.oracles import oracle_search
 from research.oracles.linear_programme import LinearProgramme
 from research.oracles.oracle_search import Config, main, search_best_input
@@ -16,12 +15,12 @@ from research.oracles.slp_refinement import refine_input
 
 SHORT, POWER, CONTINUOUS = "duffing_env/Short-v0", "duffing_env/Power-v0", "duffing_env/Amplitude-v1"
 
-pytestmark = pytest.mark.skipif(is_not_installed("highspy"), reason=install_hint("highspy"))
+pytest.importorskip("highspy", reason="highspy is not installed; make installs it")
 
 
 @pytest.fixture
 def empty_folder(monkeypatch, tmp_path):
-    monkeypatch.setattr(module_of_oracle, "FOLDER", tmp_path)
+    monkeypatch.setattr(module_of_oracle, "ORACLE_FOLDER", tmp_path)
     return tmp_path
 
 
@@ -60,9 +59,9 @@ def test_searches_of_nothing_are_refused(options, message):
 @pytest.mark.parametrize(("same", "tried"), [(np.inf, 6), (-1.0, 48)])
 def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
     found = []
-    monkeypatch.setattr(oracle_search, "_SAME", same)
+    monkeypatch.setattr(oracle_search, "_AGREEMENT", same)
     monkeypatch.setattr(
-        oracle_search, "polish", lambda *given, **told: found.append(refine_input(*given, **told)) or found[-1]
+        oracle_search, "refine_input", lambda *given, **told: found.append(refine_input(*given, **told)) or found[-1]
     )
     short = TrackSystems.of(SHORT, 1, {"horizon": 32})
     _, value, apart = search_best_input(short, 0, np.empty((0, 32)), np.random.default_rng(0), 6)
@@ -74,7 +73,7 @@ def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
 
 @pytest.mark.slow  # as above
 def test_fewer_than_three_starts_do_not_agree(monkeypatch):
-    monkeypatch.setattr(oracle_search, "_LONGER", 1)
+    monkeypatch.setattr(oracle_search, "_MAX_START_FACTOR", 1)
     short = TrackSystems.of(SHORT, 1, {"horizon": 32})
     assert search_best_input(short, 0, np.empty((0, 32)), np.random.default_rng(0), 2)[2] == np.inf
 
@@ -176,7 +175,7 @@ def test_what_does_not_come_near_its_goal_is_given_up(monkeypatch):
     sizes = probe_time_scales(ModelView(model), systems.theta[0], limits.amplitude, limits.output).scales
     start = 0.05 * np.random.default_rng(0).choice([-1.0, 1.0], 48)
     solved, best = [], LinearProgramme.best_change
-    monkeypatch.setattr(LinearProgramme, "best", lambda *given: solved.append(None) or best(*given))
+    monkeypatch.setattr(LinearProgramme, "best_change", lambda *given: solved.append(None) or best(*given))
 
     def polished(goal):
         solved.clear()

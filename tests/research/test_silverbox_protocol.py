@@ -173,11 +173,11 @@ def results(record, tmp_path_factory):
     folder = tmp_path_factory.mktemp("silverbox")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reporting, "SETTINGS", {name: SETTINGS[name] for name in FEW})
-        patch.setattr(module, "LENGTHS", (100, 500, module.TRAINING_SAMPLES))
-        patch.setattr(module, "TIMINGS", 1)
+        patch.setattr(module, "TRAINING_LENGTHS", (100, 500, module.TRAINING_SAMPLES))
+        patch.setattr(module, "N_TIMINGS", 1)
         with patch.context() as output:
             printed = []
-            output.setattr(reporting, "show", lambda *parts: printed.extend(parts))
+            output.setattr(reporting, "print_texts_and_tables", lambda *parts: printed.extend(parts))
             found = reporting.run_protocol(json=folder / "new" / "results.json", figures=folder / "figures")
     return found, folder, printed
 
