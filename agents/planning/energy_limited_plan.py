@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planning.belief_rollout import MAX_MARGIN_FRACTION, objective_at
 from agents.planning.candidate_inputs import next_uniform
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
+from agents.planning.plan_objective import MAX_MARGIN_FRACTION, objective_at
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient, project_input
 from estimator.belief import covariance_indices
 from estimator.compilation.array_operations import copy
@@ -49,7 +49,7 @@ class EnergyLimitedPlan(NamedTuple):
 
             - ``records`` (n, size): their beliefs, as `estimator.Belief` keeps them.
             - ``left`` (n,) samples, and ``energies`` (n,) energy, left in their episodes.
-            - ``objective``: `agents.planning.belief_rollout.PlanObjective` of the whole episode; the margin is of the first sample's
+            - ``objective``: `agents.planning.plan_objective.PlanObjective` of the whole episode; the margin is of the first sample's
               predictive deviations.
             - ``last`` (n,): the inputs applied last.
             - ``plans`` (n, T): the last plans, begun one sample ago; all zeros where there is none. Overwritten.

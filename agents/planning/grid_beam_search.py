@@ -89,7 +89,7 @@ class SearchProblem(NamedTuple):
         samples_left: samples left in the episode.
         n_moves: moves of the plan.
         hold_samples: samples of a move.
-        objective: `agents.planning.belief_rollout.PlanObjective`.
+        objective: `agents.planning.plan_objective.PlanObjective`.
         previous_inputs: (2,) the inputs that were applied last, newest first.
         information_factor: (K, K) factor of the information per sample that is to come.
         cells: of the map along each axis.

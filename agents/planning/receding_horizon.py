@@ -2,7 +2,7 @@
 
 The teaching of a plan has many summits, and changing a long plan here and there finds a poor one, even of a system that
 is known. So the plan is built move by move, as the best way through the map of the model's state
-(`agents.planning.grid_beam_search`). An input is held for `agents.planning.belief_rollout.PlanObjective.hold_samples` samples, a *move*. Towards the
+(`agents.planning.grid_beam_search`). An input is held for `agents.planning.plan_objective.PlanObjective.hold_samples` samples, a *move*. Towards the
 end of an episode moves become shorter, by whole numbers: so the last plan, which kept the limit, can go on as it was.
 
 The best way, the last plan and the next best one then, both begun one sample ago, each lead to a summit of their own:
@@ -22,13 +22,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planning.belief_rollout import PlanObjective, compile_belief_rollout, objective_at
+from agents.planning.belief_rollout import compile_belief_rollout
 from agents.planning.candidate_inputs import hold_samples_for, limit_slew, mutate_plan, shift_plan
 from agents.planning.d_optimality import factorise_information
 from agents.planning.discount import discount_weight_drop, fill_discount_weights, filter_delay_in_moves
 from agents.planning.grid_beam_search import SearchProblem, compile_grid_beam_search
 from agents.planning.model_probe import ModelView
 from agents.planning.newton_steps import empty_candidate_batch, fill_finite_differences, fill_newton_candidates
+from agents.planning.plan_objective import PlanObjective, objective_at
 from estimator.compilation.array_operations import copy, fill, index_of_max
 from estimator.compilation.simd import LANES, jit, jit_closure, kernel
 from estimator.models.model import Model
@@ -94,7 +95,7 @@ class RecedingHorizon(NamedTuple):
             - ``horizon``: moves to plan, at most;
             - ``rounds``: of steps and changed copies of each plan that is improved, at most, two blocks of `LANES`
               each; one that brings little is the last;
-            - ``objective``: `agents.planning.belief_rollout.PlanObjective` of the whole episode;
+            - ``objective``: `agents.planning.plan_objective.PlanObjective` of the whole episode;
             - ``previous_inputs`` (n, 2): the inputs that were applied last, newest first;
             - ``plans`` (n, horizon): the last plans, begun one move ago; overwritten by the new ones;
             - ``runner_ups`` (n, horizon): the next best ones then; overwritten as well;

@@ -19,7 +19,7 @@ What the first sensor shows should stay within the limit by a margin of standard
 predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
 and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
 that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
-(`agents.planning.belief_rollout.margin_profile`); it narrows as the noises become known. Few are at it, so much less comes true.
+(`agents.planning.plan_objective.margin_profile`); it narrows as the noises become known. Few are at it, so much less comes true.
 The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
 already, and cannot make up for what one more output tells. Where it could brake harder, most of what that would move
 the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an
@@ -46,7 +46,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from agents.planning.belief_rollout import DEFAULT_RISK, PlanObjective, margin_profile
 from agents.planning.discount import discount_moves_for
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from agents.planning.model_probe import (
@@ -58,6 +57,7 @@ from agents.planning.model_probe import (
     probe_time_scales,
     recoverable_step,
 )
+from agents.planning.plan_objective import DEFAULT_RISK, PlanObjective, margin_profile
 from agents.planning.receding_horizon import PlanSettings, compile_receding_horizon
 from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
 from estimator.engine.noise_free_response import with_coarse_substeps

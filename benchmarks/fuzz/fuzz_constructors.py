@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from agents.datasets import Config as Dataset
 from agents.hardware.run_settings import RunSettings
 from agents.policies.networks.policy_saving import save_policy
 from agents.policies.signal_export import draw_signal
-from agents.datasets import Config as Dataset
 from agents.training.training_config import TrainConfig
 from benchmarks.fuzz.bad_values import anything, changed, options
 from benchmarks.fuzz.call_verdicts import Call

@@ -28,9 +28,9 @@ from agents.cli import JsonOptions, iterate_with_progress, run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import QUANTISATION_LEVELS, Oracle, TrackSystems, quantise
 from agents.planning import receding_horizon as planning
-from agents.planning.belief_rollout import PlanObjective
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from agents.planning.model_probe import ModelView, probe_time_scales
+from agents.planning.plan_objective import PlanObjective
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from estimator.belief import Belief
 from estimator.support.argument_checks import MAX_SEED, check_integer

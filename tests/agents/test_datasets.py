@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.evaluation.track_batch import make_track_batch
 from agents import datasets
 from agents.datasets import Config, collect_episodes, main
+from agents.evaluation.track_batch import make_track_batch
 
 ROOT = Path(__file__).parents[2]
 SHORT = "duffing_env/Short-v0"

@@ -7,9 +7,10 @@ import pytest
 from reference.plants import DRAG
 from tables import table
 
-from agents.planning.belief_rollout import PlanObjective, compile_belief_rollout
+from agents.planning.belief_rollout import compile_belief_rollout
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
+from agents.planning.plan_objective import PlanObjective
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.tracks.continuous_tracks import ContinuousExperiment
 from estimator.belief import Belief
