@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.planning.model_probe import TimeScales
+from agents.planning.time_scales import TimeScales
 from estimator.compilation.simd import jit
 
 #: What a plan teaches counts e times less so many moves later, or so much of the moves that a swing takes to come near

@@ -9,7 +9,7 @@ A way's score is what it has taught together with what the rest of the episode w
 last plans. Without the latter a way would be praised for what every way teaches sooner or later.
 
 The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
-line. Each state is measured by its size when the first sensor is at its limit (`agents.planning.model_probe.TimeScales`). Other
+line. Each state is measured by its size when the first sensor is at its limit (`agents.planning.time_scales.TimeScales`). Other
 states, and older inputs, are followed with their way, and do not tell ways apart.
 """
 

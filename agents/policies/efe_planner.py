@@ -48,17 +48,10 @@ import numpy.typing as npt
 
 from agents.planning.discount import discount_moves_for
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
-from agents.planning.model_probe import (
-    ModelView,
-    is_on_rig,
-    kept_accumulated_noise,
-    observation_layout,
-    planning_limit,
-    probe_time_scales,
-    recoverable_step,
-)
+from agents.planning.model_probe import ModelView, is_on_rig, observation_layout, planning_limit
 from agents.planning.plan_objective import DEFAULT_RISK, PlanObjective, margin_profile
-from agents.planning.receding_horizon import PlanSettings, compile_receding_horizon
+from agents.planning.receding_horizon import PlanArrays, PlanSettings, compile_receding_horizon
+from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales, recoverable_step
 from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
 from estimator.engine.noise_free_response import with_coarse_substeps
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
@@ -243,71 +236,55 @@ class EfePlanner:
             ValueError: as `checked_rows`.
         """
         rows, episode_begins = self.checked_rows(observation, state, EfePlannerState, episode_start)
-        records, n = self._env.records, len(rows)
-        k, objective = self.model_view.model.n_coefficients, self.objective
-        if state is None:
-            streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
-            rng_states = np.array([stream.state["state"]["state"] for stream in streams])
-            plans, information_rates, remaining_holds = (
-                np.zeros((n, self.horizon)),
-                np.zeros((n, k, k)),
-                np.zeros(n, dtype=np.int64),
-            )
-            state = EfePlannerState(
-                plans,
-                plans,
-                information_rates,
-                rng_states,
-                np.zeros(n),
-                np.zeros(n),
-                remaining_holds,
-                np.ones_like(remaining_holds),
-            )
-        plans, runner_ups = state.plans.copy(), state.runner_ups.copy()
-        information_rates, rng_states = state.information_rates.copy(), state.rng_states.copy()
-        older_inputs, chosen = state.last_inputs.copy(), state.chosen_inputs.copy()
-        remaining_holds, holds = state.remaining_holds.copy(), state.holds.copy()
-        (
-            plans[episode_begins],
-            runner_ups[episode_begins],
-            information_rates[episode_begins],
-            older_inputs[episode_begins],
-            remaining_holds[episode_begins],
-        ) = 0.0, 0.0, 0.0, 0.0, 0
+        records, objective = self._env.records, self.objective
+        state = self._new_state(len(rows)) if state is None else EfePlannerState(*(part.copy() for part in state))
+        older_inputs, remaining_holds = state.last_inputs, state.remaining_holds
+        for part in (state.plans, state.runner_ups, state.information_rates, older_inputs, remaining_holds):
+            part[episode_begins] = 0
         layout = observation_layout(self.model_view.model)
         samples_left = np.rint(rows[:, layout.time_left] * self._env.horizon).astype(np.int64)
         last_inputs = objective.amplitude * rows[:, layout.last_input]
         due = np.flatnonzero(remaining_holds == 0)
-        inputs = np.empty(len(due))
-        searched = plans[due], runner_ups[due], information_rates[due], rng_states[due]
+        arrays = PlanArrays(
+            state.plans[due],
+            state.runner_ups[due],
+            state.information_rates[due],
+            state.rng_states[due],
+            np.empty(len(due)),
+            state.holds[due],
+        )
         if self._energy is not None:
             energies = rows[:, layout.budget_left] * self._energy
             self._plan_rest_of_episode(
-                records, samples_left, energies, objective, last_inputs, searched[0], searched[3], inputs
+                records, samples_left, energies, objective, last_inputs, arrays.plans, arrays.rng_states, arrays.actions
             )
         else:
             previous_inputs = np.stack([last_inputs, older_inputs], axis=1)[due]
-            holds_of_due = holds[due]
             compile_receding_horizon(*self.model_view).plan(
-                records[due],
-                samples_left[due],
-                self.horizon,
-                self.rounds,
-                objective,
-                previous_inputs,
-                *searched,
-                inputs,
-                holds_of_due,
+                records[due], samples_left[due], self.horizon, self.rounds, objective, previous_inputs, arrays
             )
-            remaining_holds[due] = holds[due] = holds_of_due
+            remaining_holds[due] = arrays.holds
             remaining_holds -= 1
-        plans[due], runner_ups[due], information_rates[due], rng_states[due] = searched
-        chosen[due] = inputs
-        actions = (chosen / objective.amplitude).astype(np.float32)
-        state = EfePlannerState(
-            plans, runner_ups, information_rates, rng_states, last_inputs, chosen, remaining_holds, holds
+        for name in ("plans", "runner_ups", "information_rates", "rng_states", "holds"):
+            getattr(state, name)[due] = getattr(arrays, name)
+        state.chosen_inputs[due] = arrays.actions
+        actions = (state.chosen_inputs / objective.amplitude).astype(np.float32)
+        return actions.reshape(*np.shape(observation)[:-1], 1), state._replace(last_inputs=last_inputs)
+
+    def _new_state(self, n: int) -> EfePlannerState:
+        """The state of n environments before their first decision."""
+        k = self.model_view.model.n_coefficients
+        streams = map(np.random.SFC64, np.random.SeedSequence(self.seed).spawn(n))
+        return EfePlannerState(
+            plans=np.zeros((n, self.horizon)),
+            runner_ups=np.zeros((n, self.horizon)),
+            information_rates=np.zeros((n, k, k)),
+            rng_states=np.array([stream.state["state"]["state"] for stream in streams]),
+            last_inputs=np.zeros(n),
+            chosen_inputs=np.zeros(n),
+            remaining_holds=np.zeros(n, dtype=np.int64),
+            holds=np.ones(n, dtype=np.int64),
         )
-        return actions.reshape(*np.shape(observation)[:-1], 1), state
 
     def checked_rows(
         self,

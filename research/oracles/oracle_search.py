@@ -27,14 +27,15 @@ import numpy as np
 from agents.cli import JsonOptions, iterate_with_progress, run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import QUANTISATION_LEVELS, Oracle, TrackSystems, quantise
-from agents.planning import receding_horizon as planning
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
-from agents.planning.model_probe import ModelView, probe_time_scales
+from agents.planning.model_probe import ModelView
 from agents.planning.plan_objective import PlanObjective
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
+from agents.planning.time_scales import probe_time_scales
 from estimator.belief import Belief
 from estimator.support.argument_checks import MAX_SEED, check_integer
 from estimator.support.array_types import FloatArray
+from research.oracles.beam_start import compile_beam_start
 from research.oracles.linear_programme import import_highspy
 from research.oracles.slp_refinement import refine_input
 
@@ -125,8 +126,7 @@ def _beam_search_start(
     objective = PlanObjective(
         limits.amplitude, np.inf, limits.soft_limit, 0.0, np.zeros(model.n_coefficients), state_scales
     )
-    view = ModelView(model, one.degree)
-    planning.compile_receding_horizon(*view).beam_through(
+    compile_beam_start(model, one.degree)(
         record, first, int(rng.choice(_CELL_COUNTS)), objective, information_rate, rng_state, u
     )
     return u

@@ -170,7 +170,7 @@ def refine_input(
         degree: of the input's polynomial over a sample.
         nominal: what the worth is taken at.
         limits: to be kept; ``aim`` is the limit of the signal that is aimed at. The energy may be exceeded a little.
-        state_scales: (n,) of the states (`agents.planning.model_probe.TimeScales`).
+        state_scales: (n,) of the states (`agents.planning.time_scales.TimeScales`).
         u: (T,) inputs, which may be beyond the limits of signal and energy.
         quantum: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a
             hard oscillator errors grow by several powers of ten over an episode.

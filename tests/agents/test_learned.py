@@ -424,7 +424,9 @@ def unpickling(source):
 
 
 def test_the_search_covers_the_package():
-    assert {"checkpoints", "policy_evaluation", "trained_policy", "signals", "sb3_vec_env"} <= {path.stem for path in SOURCES}
+    assert {"checkpoints", "policy_evaluation", "trained_policy", "signals", "sb3_vec_env"} <= {
+        path.stem for path in SOURCES
+    }
 
 
 @table("path", SOURCES)

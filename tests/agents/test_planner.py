@@ -16,10 +16,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tables import table
 
 import duffing_env
-from agents.planning.model_probe import ModelView, probe_time_scales, recoverable_step
+from agents.planning.model_probe import ModelView
 from agents.planning.open_loop import chance_constrained_block
 from agents.planning.plan_objective import PlanObjective
 from agents.planning.receding_horizon import compile_receding_horizon
+from agents.planning.time_scales import probe_time_scales, recoverable_step
 from agents.policies import block_planner, make_policy
 from agents.policies.block_planner import BlockPlanner
 from agents.policies.efe_planner import EfePlanner

@@ -7,7 +7,8 @@ import pytest
 
 from agents.evaluation import oracle as module_of_oracle
 from agents.evaluation.oracle import Oracle, TrackSystems
-from agents.planning.model_probe import ModelView, probe_time_scales
+from agents.planning.model_probe import ModelView
+from agents.planning.time_scales import probe_time_scales
 from research.oracles import oracle_search
 from research.oracles.linear_programme import LinearProgramme
 from research.oracles.oracle_search import Config, main, search_best_input

@@ -27,13 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planning.d_optimality import half_log_det, invert_from_cholesky
-from agents.planning.model_probe import (
-    ModelView,
-    kept_accumulated_noise,
-    observation_layout,
-    planning_limit,
-    probe_time_scales,
-)
+from agents.planning.model_probe import ModelView, observation_layout, planning_limit
+from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales
 from estimator.compilation.array_operations import copy, copy_scaled, fill
 from estimator.compilation.simd import jit, jit_closure, kernel
 from estimator.engine.noise_free_response import compile_noise_free_response
