@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.networks.rollout_features import FEATURE_NAMES, FeatureEncoder
+from agents.policies.networks.feature_encoder import FeatureEncoder
+from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.predict_checks import check_observation_finite, check_observation_size
 from estimator.support.argument_checks import to_float_array
 

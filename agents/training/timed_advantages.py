@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from agents.policies.networks.rollout_features import FEATURE_NAMES
+from agents.policies.networks.feature_names import FEATURE_NAMES
 
 _TIME_LEFT_INDEX = FEATURE_NAMES.index("time_left")
 

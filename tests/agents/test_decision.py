@@ -11,7 +11,8 @@ from tables import table
 from agents import make_policy
 from agents.commands import main
 from agents.evaluation.track_batch import make_track_batch
-from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder
+from agents.policies.networks.feature_encoder import FeatureEncoder
+from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.policies.networks.trained_policy import (
     CARD_FILE,
     CARD_FORMAT,

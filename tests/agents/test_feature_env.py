@@ -8,8 +8,9 @@ from tables import table
 
 from agents import make_policy
 from agents.evaluation.track_batch import make_track_batch
+from agents.policies.networks.feature_encoder import FeatureEncoder
+from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.policies.networks.policy_saving import save_policy
-from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder
 from agents.policies.networks.trained_policy import load_policy
 from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, PPOSettings, TrainConfig, train

@@ -16,7 +16,8 @@ from tables import table
 from agents import make_policy
 from agents.evaluation.track_batch import make_track_batch
 from agents.planning.model_probe import observation_layout
-from agents.policies.networks.rollout_features import FEATURE_NAMES, MAX_FEATURE, FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_encoder import FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_names import FEATURE_NAMES, MAX_FEATURE
 from estimator.engine.noise_free_response import compile_noise_free_response
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"

@@ -19,7 +19,7 @@ from safetensors.numpy import load_file, save_file
 import agents
 from agents import make_policy
 from agents.interruption import Interrupted
-from agents.policies.networks.rollout_features import FEATURE_NAMES
+from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, TrainConfig, resume, train
 from agents.training.checkpoints import (

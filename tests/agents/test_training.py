@@ -22,7 +22,7 @@ from agents.console_output import write_json
 from agents.evaluation.comparison_tables import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
-from agents.policies.networks.rollout_features import FEATURE_NAMES
+from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.hyperparameters import parse_hyperparameters
 from agents.training.training_config import describe_run

@@ -7,7 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureSettings
+from agents.policies.networks.feature_encoder import FeatureSettings
+from agents.policies.networks.feature_names import MAX_FEATURE
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.models.difference_equation import difference
 

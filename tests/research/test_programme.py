@@ -69,5 +69,7 @@ def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_ne
 
 def test_without_highspy_it_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "highspy", None)
-    with pytest.raises(ModuleNotFoundError, match=r"^highspy is not installed; get it with: pip install 'highspy>=1.10"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"^highspy is not installed; get it with: pip install 'highspy>=1.10"
+    ):
         LinearProgramme(SAMPLES, STATES, 0, DesignLimits(0.52, 0.51, 0.1, np.inf))

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from agents.console_output import check_output_folder
 from agents.policies.custom_policies import check_wrappers, wrapped_environments
-from agents.policies.networks.rollout_features import MAX_FEATURE
+from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.policies.networks.trained_policy import (
     ACTIVATIONS,
     CARD_FILE,

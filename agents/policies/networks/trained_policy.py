@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.policies.networks.compiled_actor import CompiledActor, compile_decision
-from agents.policies.networks.rollout_features import FeatureEncoder
-from agents.predict_checks import check_observation_finite, check_observation_size, check_state, episode_starts
+from agents.policies.networks.feature_encoder import FeatureEncoder
+from agents.policies.networks.lstm import FloatArray, Lstm, checked_tensor
+from agents.predict_checks import check_observation_finite, check_observation_size
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_integer, check_number, to_float_array
 from estimator.support.file_io import check_readable_file
@@ -36,8 +37,6 @@ MAX_STEPS = 10**15
 #: No file of a policy is larger [bytes].
 _MAX_FILE_BYTES = 2**30
 
-FloatArray = npt.NDArray[np.float32]
-LstmState = tuple[FloatArray, FloatArray]
 
 ACTIVATIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "tanh": np.tanh,
@@ -102,12 +101,12 @@ class TrainedPolicy:
         self, network: NetworkCard, tensors: Mapping[str, FloatArray], card: dict[str, Any], seed: int = 0
     ) -> None:
         def layer(name: str, inputs: int | None, outputs: int | None = None) -> tuple[FloatArray, FloatArray]:
-            weight = _tensor(tensors, f"{name}.weight", outputs, inputs)
-            return weight, _tensor(tensors, f"{name}.bias", len(weight))
+            weight = checked_tensor(tensors, f"{name}.weight", outputs, inputs)
+            return weight, checked_tensor(tensors, f"{name}.bias", len(weight))
 
         self.card, self.network = card, network
         self._activation = ACTIVATIONS[network.activation]
-        self._memory = None if network.memory is None else _Lstm(network.memory, tensors)
+        self._memory = None if network.memory is None else Lstm(network.memory, tensors)
         width = None if self._memory is None else self._memory.units
         self.layers: list[tuple[FloatArray, FloatArray]] = []
         for name in network.layers[:-1]:
@@ -119,7 +118,7 @@ class TrainedPolicy:
         if network.spread is not None:
             is_tensor = network.spread in tensors
             last = self.layers[-1][0].shape[1]
-            self._spread = _tensor(tensors, network.spread, 1) if is_tensor else layer(network.spread, last, 1)
+            self._spread = checked_tensor(tensors, network.spread, 1) if is_tensor else layer(network.spread, last, 1)
         self._n_inputs = (self.layers[0][0] if self._memory is None else self._memory.from_input).shape[1]
         self._description = card.get("features") or {}
         self._encoder: FeatureEncoder | None = None
@@ -130,7 +129,7 @@ class TrainedPolicy:
             self._encoder = found
         self.normalizer: tuple[FloatArray, FloatArray, float] | None = None
         if network.normalised:
-            mean, std = (_tensor(tensors, f"normalizer.{part}", self._n_inputs) for part in ("mean", "std"))
+            mean, std = (checked_tensor(tensors, f"normalizer.{part}", self._n_inputs) for part in ("mean", "std"))
             check_number("normalised", network.normalised)
             if std.min() <= 0:
                 raise ValueError(f"normalizer.std must be positive, but is {std.min()} somewhere; take 1 there")
@@ -277,54 +276,6 @@ def _observation_in_card(card: dict[str, Any]) -> Any:
     config = card.get("config")
     options = config.get("options") if isinstance(config, dict) else None
     return card.get("observation", options.get("observation") if isinstance(options, dict) else None)
-
-
-def _tensor(tensors: Mapping[str, FloatArray], name: str, *shape: int | None) -> FloatArray:
-    """A tensor that a network can calculate with; None stands for any length of a side."""
-    found = tensors[name]
-    sides = zip(found.shape, shape, strict=False)
-    fits = found.ndim == len(shape) and all(
-        length > 0 and length_wanted in (None, length) for length, length_wanted in sides
-    )
-    must = f"{name} must be finite float32 of shape {tuple('any' if length_wanted is None else length_wanted for length_wanted in shape)}"
-    if not fits or found.dtype != np.float32:
-        raise ValueError(f"{must}, but is {found.dtype} of {found.shape}")
-    if bad := np.count_nonzero(~np.isfinite(found)):
-        raise ValueError(f"{must}, but {bad} of its {found.size} numbers are not finite; find what made them so")
-    return found
-
-
-class _Lstm:
-    """An LSTM of one layer, with torch's tensors: gates in the order input, forget, cell, output."""
-
-    def __init__(self, name: str, tensors: Mapping[str, FloatArray]) -> None:
-        self._from_hidden = _tensor(tensors, f"{name}.weight_hh_l0", None, None)
-        self.units = self._from_hidden.shape[1]
-        gates = 4 * self.units
-        _tensor(tensors, f"{name}.weight_hh_l0", gates, self.units)
-        self.from_input = _tensor(tensors, f"{name}.weight_ih_l0", gates, None)
-        self._bias = _tensor(tensors, f"{name}.bias_ih_l0", gates) + _tensor(tensors, f"{name}.bias_hh_l0", gates)
-
-    def update(self, inputs: FloatArray, state: LstmState | None, episode_start: npt.ArrayLike | None) -> LstmState:
-        """Hidden and cell values (1, n, units) after inputs (n, features)."""
-        zeros = np.zeros((1, len(inputs), self.units), dtype=np.float32)
-        if state is not None:
-            check_state(state, 2)
-        hidden, cell = (zeros, zeros) if state is None else state
-        if hidden.shape != zeros.shape or cell.shape != zeros.shape:
-            raise ValueError(f"state must be two arrays of shape {zeros.shape}, but has {hidden.shape}, {cell.shape}")
-        if episode_start is not None:
-            goes_on = ~episode_starts(episode_start, len(inputs))[:, None]
-            hidden, cell = hidden * goes_on, cell * goes_on
-        gates = inputs @ self.from_input.T + hidden[0] @ self._from_hidden.T + self._bias
-        input_gate, forget_gate, candidate, output_gate = np.split(gates, 4, axis=-1)
-        cell = _sigmoid(forget_gate) * cell[0] + _sigmoid(input_gate) * np.tanh(candidate)
-        hidden = _sigmoid(output_gate) * np.tanh(cell)
-        return hidden[None].astype(np.float32), cell[None].astype(np.float32)
-
-
-def _sigmoid(x: FloatArray) -> FloatArray:
-    return np.float32(0.5) * (np.float32(1) + np.tanh(np.float32(0.5) * x))
 
 
 def load_policy(folder: str | Path, seed: int = 0) -> TrainedPolicy:

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_encoder import FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.sb3_vec_env import DuffingVecEnv
 
 #: Rewards are scaled to returns of about 1, where a critic begins.

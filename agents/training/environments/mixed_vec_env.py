@@ -13,7 +13,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from agents.evaluation.track_batch import make_track_batch
-from agents.policies.networks.rollout_features import MAX_FEATURE, FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_encoder import FeatureEncoder, ShieldedFeatures
+from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.sb3_vec_env import BatchVecEnv, info_of_row, infos_by_row
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, has_shaping_potential
 from duffing_env.vector_env import DuffingVectorEnv
