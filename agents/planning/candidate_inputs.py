@@ -1,4 +1,5 @@
-"""Inputs that the search tries: of the last plan, chosen, changed at random, and kept within their limits."""
+"""Candidate inputs of the search: shifted last plans, allowed inputs, random mutations, and the slew limit.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +8,24 @@ import numpy as np
 from duffing_env.storage.random_streams import sfc64_next, to_uniform
 from estimator.compilation.simd import jit
 
-#: Inputs to choose from, in parts of the largest. Of what is further off in a plan, the first five will do, then two.
+#: Inputs to choose from, in parts of the largest. Later in a plan the first five are tried, then the first two.
 INPUT_FRACTIONS = (1.0, -1.0, 0.0, 0.5, -0.5, 0.75, -0.75, 0.25, -0.25)
 
-#: Of small changes, so many move an input by up to so much of the largest; the higher the power, the sooner in a plan.
-_PERTURB_PROBABILITY, _PERTURB_FRACTION, _EARLY_POWER = 0.5, 0.3, 3
+#: Probability that a mutation perturbs one input or two.
+_PERTURB_PROBABILITY = 0.5
+
+#: Largest perturbation in parts of the largest input.
+_PERTURB_FRACTION = 0.3
+
+#: Power of a uniform number that draws the perturbed move: the higher, the earlier.
+_EARLY_POWER = 3
 
 
 @jit
 def hold_samples_for(samples_left, n_moves, max_hold):
-    """Samples of a move, where so many are left in an episode of which the rest should take so many moves.
+    """Samples of a move, so that the samples left take about ``n_moves`` moves.
 
-    Each is a divisor of the longer one before it.
+    Each value is a divisor of the longer one before it.
 
     Example:
         >>> [hold_samples_for(left, 24, 6) for left in (256, 84, 83, 36, 35)]
@@ -36,9 +43,9 @@ def hold_samples_for(samples_left, n_moves, max_hold):
 
 @jit
 def shift_plan(plan, n_moves, previous_hold, hold):
-    """Take off the first move of a plan, which was played, and divide the others where moves are shorter than before.
+    """Drop the first move of a plan, which was played, and divide the others where moves are shorter than before.
 
-    A plan of so many steps that is not divided ends with what was taken off, turned over.
+    A plan that is not divided ends with the mirrored first move.
 
     Example:
         >>> plan = np.array([1.0, 0.5, -1.0, 0.0])
@@ -61,7 +68,7 @@ def shift_plan(plan, n_moves, previous_hold, hold):
 
 @jit
 def allowed_input(fraction_index, previous_input, objective):
-    """The input nearest to one of `INPUT_FRACTIONS` that is allowed after ``previous_input``."""
+    """The input nearest to one of `INPUT_FRACTIONS` within the slew limit after ``previous_input``."""
     return max(
         previous_input - objective.slew,
         min(INPUT_FRACTIONS[fraction_index] * objective.amplitude, previous_input + objective.slew),
@@ -70,7 +77,7 @@ def allowed_input(fraction_index, previous_input, objective):
 
 @jit
 def limit_slew(plan, n_moves, previous_input, objective):
-    """Cut changes of the input beyond the slew limit, where there is one, as the environment does."""
+    """Clip changes of the input to the slew limit, as the environment does."""
     if objective.slew == np.inf:
         return
     for h in range(n_moves):
@@ -80,7 +87,7 @@ def limit_slew(plan, n_moves, previous_input, objective):
 
 @jit
 def mutate_plan(plan, n_moves, amplitude, rng_state):
-    """Change a candidate a little: move one input or two, turn one, two or a run of them over, or shift it."""
+    """Mutate a plan: perturb one input or two, mirror one, two or a run of inputs, or shift it."""
     if next_uniform(rng_state) < _PERTURB_PROBABILITY:
         h = np.int64(next_uniform(rng_state) ** _EARLY_POWER * n_moves)
         perturb_input(plan, h, amplitude, rng_state)
@@ -111,14 +118,14 @@ def mutate_plan(plan, n_moves, amplitude, rng_state):
 
 @jit
 def perturb_input(plan, move, amplitude, rng_state):
-    """Move an input a little: how near to its limit a signal turns depends on little."""
+    """Perturb an input: small changes decide how near to its limit a signal turns."""
     perturbed = plan[move] + _PERTURB_FRACTION * amplitude * (2.0 * next_uniform(rng_state) - 1.0)
     plan[move] = max(-amplitude, min(perturbed, amplitude))
 
 
 @jit
 def next_uniform(rng_state):
-    """A number in (0, 1) from a stream (4,), which moves on."""
+    """The next number in (0, 1) of a stream (4,)."""
     value, rng_state[0], rng_state[1], rng_state[2], rng_state[3] = sfc64_next(
         rng_state[0], rng_state[1], rng_state[2], rng_state[3]
     )

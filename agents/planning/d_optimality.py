@@ -1,17 +1,17 @@
-"""The worth of a sequence of inputs, and its exact gradient, compiled for any model: what oracle and planner climb.
+"""D-optimality of a sequence of inputs and its exact gradient, compiled for any model, for planners and oracles.
 
-The worth is ½ log det(Λ + F(u)) in nats, with F the Fisher information of the model's coefficients along the response
-without noise (`estimator.inference.fisher_information`) and Λ what is known before, less a penalty where the first sensor's signal x
-goes beyond a limit L:
+The criterion is ½ log det(Λ + F(u)) [nats], with F the Fisher information of the model's coefficients along the
+response without noise (`estimator.inference.fisher_information`) and Λ the prior precision, less a penalty where the
+first sensor's signal x exceeds a limit L:
 
     J(u) = ½ log det(Λ + F(u)) - ρ Σ_t max(0, |x_t| / L - 1)²
 
-The gradient is the reverse derivative of this arithmetic, which the engine generates: one pass forward that keeps what
-every step begins with, one backward.
+The engine generates the gradient by the adjoint method: a pass forward stores the state before every sample, a pass
+backward differentiates.
 
-A *start* is what a step begins with: the rows of a path, that is the states, the filter's covariance V of them (upper
-triangle) and their sensitivities Z to the coefficients (row by row), then the older inputs that the first sample
-depends on, the newest first. All zeros is at rest.
+A *start* is the state before the first sample: the rows of a path, that is the states, the filter's covariance V of
+them (upper triangle) and their sensitivities Z to the coefficients (row by row), then the older inputs that the first
+sample depends on, the newest first. All zeros is at rest.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from estimator.engine.input_hold import n_older_inputs
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
-#: A trajectory is followed no further than to this many times the limit: a difference equation blows up.
+#: Multiple of the limit at which a trajectory ends: difference equations diverge.
 DIVERGED_RATIO = 1.2
 
 
 class NominalSystem(NamedTuple):
-    """What a worth is taken at.
+    """The system at which a criterion is evaluated.
 
     Attributes:
-        coefficients: (K,) the model's.
+        coefficients: (K,) of the model.
         precision: (K, K) Λ.
         noises: variances of the process noise and of each sensor's (`estimator.inference.record_filter.noise_variances`).
     """
@@ -48,12 +48,12 @@ class NominalSystem(NamedTuple):
 
 
 class GradientWorkspace(NamedTuple):
-    """What climbing writes on.
+    """Memory of one evaluation.
 
     Attributes:
-        tape: (T, size) what every sample began with.
+        tape: (T, size) the state before every sample.
         output_signal: (T,) the first sensor's signal.
-        F: (K, K) Λ + F, whose lower triangle becomes its factor.
+        F: (K, K) Λ + F; its lower triangle becomes the Cholesky factor.
         G: (K, K) its inverse.
         gradient: (T,) ∂J/∂u.
     """
@@ -70,13 +70,13 @@ class DOptimality(NamedTuple):
 
     Attributes:
         start_size: numbers in a start.
-        n_path: of these, the rows of a path.
-        workspace: ``workspace(T)``, a `GradientWorkspace` for up to T samples.
-        criterion: ``criterion(nominal, limit, penalty, start, u, workspace)``: J(u) [nats] of inputs (T,), and the peak of |x|. A
-            trajectory that is lost (`DIVERGED_RATIO`) counts what it told until then.
-        criterion_and_gradient: as ``criterion``, and fills in ``workspace.gradient``.
-        input_at: ``input_at(start, u, t)``: the input at sample t, which may lie before the first.
-        path_functions: `estimator.engine.adjoint.compile_adjoint`, for those who follow a path themselves.
+        n_path: rows of a path among them.
+        workspace: ``workspace(T)`` makes a `GradientWorkspace` for up to T samples.
+        criterion: ``criterion(nominal, limit, penalty, start, u, workspace)`` returns J(u) [nats] of inputs (T,), and
+            the peak of |x|. A trajectory that diverges (`DIVERGED_RATIO`) counts up to that sample.
+        criterion_and_gradient: the same, and fills in ``workspace.gradient``.
+        input_at: ``input_at(start, u, t)`` returns the input at sample t, which may lie before the first.
+        path_functions: of `estimator.engine.adjoint.compile_adjoint`.
     """
 
     start_size: int
@@ -90,7 +90,7 @@ class DOptimality(NamedTuple):
 
 @cache
 def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
-    """The worth of inputs to a model, and its gradient.
+    """Compile the criterion of a model and its gradient.
 
     Args:
         model: the equation.
@@ -127,7 +127,7 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
 
     @jit_closure(compile_key)
     def simulate(nominal, limit, start, u, memory):
-        """Follow the inputs; gives the steps that were followed, the peak of |x|, and Σ max(0, |x| / L - 1)²."""
+        """Simulate the inputs; return the number of samples, the peak of |x|, and Σ max(0, |x| / L - 1)²."""
         tape, output_signal, noises = memory.tape, memory.output_signal, nominal.noises
         C = coefficients_of(nominal.coefficients)
         P, F = begin(start)
@@ -177,7 +177,7 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
 
 @jit
 def half_log_det(A):
-    """½ log det of a symmetric positive definite matrix, whose lower triangle is overwritten by its factor.
+    """½ log det of a symmetric positive definite matrix; its Cholesky factor overwrites the lower triangle.
 
     Minus infinity where it is not positive definite.
     """
@@ -200,7 +200,7 @@ def half_log_det(A):
 
 @jit
 def invert_from_cholesky(L, inverse):
-    """The inverse of L Lᵀ, from the lower triangle of L."""
+    """Fill in the inverse of L Lᵀ, from the lower triangle of L."""
     size = len(L)
     column = np.empty(size)
     for j in range(size):
@@ -213,7 +213,7 @@ def invert_from_cholesky(L, inverse):
 
 @jit
 def solve_from_cholesky(L, rhs):
-    """Solve L Lᵀ x = given x in place, from the lower triangle of L, of as many rows as x has."""
+    """Solve L Lᵀ x = rhs in place, from as many rows of the lower triangle of L as rhs has."""
     size = len(rhs)
     for i in range(size):
         total = rhs[i]
@@ -229,7 +229,7 @@ def solve_from_cholesky(L, rhs):
 
 @jit
 def factorise_information(information, factor):
-    """The factor M of an information M Mᵀ; zeros where there is none, or it tells nothing of a coefficient."""
+    """Fill in the factor M of an information M Mᵀ; zeros where the information is singular."""
     copy_scaled(factor, 1.0, information)
     if half_log_det(factor) == -np.inf:
         for row in range(len(factor)):

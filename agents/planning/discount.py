@@ -1,12 +1,12 @@
-"""What a plan teaches counts the less, the later it teaches it.
+"""Discount of a plan's information: later moves count less, as a plan is made anew at each move.
 
-A plan is made anew at each move, and its later moves will be others. So what move h of a plan teaches counts
+The information after move h of a plan counts
 
-    w_h = exp(-h / faded)
+    w_h = exp(-h / discount_moves)
 
-and a plan is worth the mean of what is known after each of its moves, after move h with the weight w_h - w_{h+1}, and
-with the rest of the weight at its end. Were all moves to count alike, the best plan might be to wait for a move, and so
-at every decision anew. Of plans that reach the end of the episode all do count alike: ``discount_moves`` is infinite.
+and the score of a plan is the mean of the information after each of its moves, with weight w_h - w_{h+1} after move h
+and the remaining weight at its end. If all moves counted alike, the best plan could be to wait for a move, at every
+decision anew. In plans that reach the end of the episode all do count alike: ``discount_moves`` is infinite.
 """
 
 from __future__ import annotations
@@ -16,17 +16,21 @@ import numpy as np
 from agents.planning.time_scales import TimeScales
 from estimator.compilation.simd import jit
 
-#: What a plan teaches counts e times less so many moves later, or so much of the moves that a swing takes to come near
-#: the limit, and at most so many: where a swing has to be built for long, it pays late. Chosen on `validation`.
-_MIN_DISCOUNT_MOVES, _RISE_TIME_FRACTION, _MAX_DISCOUNT_MOVES = 6.0, 1 / 3.5, 36.0
+#: Moves after which information counts e times less, at least.
+_MIN_DISCOUNT_MOVES = 6.0
 
-#: The same so many moves later still, for each sample over which the filter averages its outputs: with a noisy sensor,
-#: what a move teaches comes late. Chosen on the branch `validation`.
+#: The same in parts of the moves in which an oscillation rises to the limit: a slow rise pays late.
+_RISE_TIME_FRACTION = 1 / 3.5
+
+#: The same at most, in moves.
+_MAX_DISCOUNT_MOVES = 36.0
+
+#: Samples of additional delay per sample over which the filter averages outputs: a noisy sensor delays information.
 _DELAY_FACTOR = 4.0
 
 
 def discount_moves_for(time_scales: TimeScales) -> float:
-    """Moves in which what a plan teaches fades by e, with a sensor without noise."""
+    """Moves after which information counts e times less, with a sensor without noise."""
     return float(
         np.clip(
             _RISE_TIME_FRACTION * time_scales.rise_time / time_scales.hold_samples,
@@ -38,9 +42,9 @@ def discount_moves_for(time_scales: TimeScales) -> float:
 
 @jit
 def filter_delay(process_variance, sensor_variance):
-    """Samples that a noisy sensor delays what a plan teaches by, from the variances of process noise and sensor.
+    """Samples by which a noisy sensor delays information, from the variances of process noise and sensor.
 
-    A filter averages outputs over about the fourth root of their ratio.
+    A filter averages outputs over about the fourth root of their ratio, in samples.
 
     Example:
         >>> [round(filter_delay(1.0, ratio), 1) for ratio in (0.0, 1.0, 625.0)]
@@ -51,9 +55,10 @@ def filter_delay(process_variance, sensor_variance):
 
 @jit
 def filter_delay_in_moves(record, noise_index, hold_samples):
-    """Moves of so many samples that the noises of a belief delay what a plan teaches by.
+    """Moves of ``hold_samples`` samples by which the noises of a belief delay information.
 
-    ``noise_index`` is where its record has the shape of the sensor's precision (`agents.planning.belief_rollout.BeliefRollout`).
+    ``noise_index`` is where the record has the shape of the sensor's precision
+    (`agents.planning.belief_rollout.BeliefRollout`).
     """
     process_variance, sensor_variance = (
         record[noise_index - 1] / record[noise_index - 2],
@@ -64,7 +69,7 @@ def filter_delay_in_moves(record, noise_index, hold_samples):
 
 @jit
 def fill_discount_weights(weights, n_moves, discount_moves):
-    """Write the weights of so many moves.
+    """Fill in the weights of a plan's moves.
 
     Example:
         >>> weights = np.zeros(4)
@@ -78,7 +83,7 @@ def fill_discount_weights(weights, n_moves, discount_moves):
 
 @jit
 def discount_weight_drop(weights, move, n_moves):
-    """What is known after move h of so many counts for this part of the sum of all.
+    """The weight of the information after a move, as part of the sum of all.
 
     Example:
         >>> weights = np.array([1.0, 0.6, 0.4, 0.0])

@@ -1,15 +1,15 @@
-"""Steps that improve a whole plan at once: the more it teaches, the nearer it leads to the limit.
+"""Newton steps on a whole plan of inputs, with the cost of leading near the limit in their model.
 
-Near a limit, whatever is changed of one input alone makes the plan worse, as all that follows leads beyond it, or away
-from it. So the first inputs u of a plan are changed together, by a model of what the plan is worth,
+Near a limit, every change of one input alone makes a plan worse: all later outputs lead beyond the limit, or away from
+it. So the first inputs u of a plan change together, by a model of its score,
 
     J(u + d) ≈ J(u) + gᵀ d - K Σ_h w_h [max(0, z_h + Z_hᵀ d)⁴ - max(0, z_h)⁴] - ½ λ |d|²
 
-with z_h how many standard deviations the output of move h is within its margin (`agents.planning.belief_rollout`), Z_h its
-derivative, w_h how much that counts, and g the derivative of what the plan teaches. Derivatives are differences: each
-lane of a block imagines the plan with one input nudged. The smaller λ, the longer the step. For one λ after another,
-the next step is the last one and an iteration of Newton's, within the largest input. Which step is best is then
-imagined.
+with z_h the standard deviations by which the output of move h is within its margin (`agents.planning.belief_rollout`),
+Z_h its derivative, w_h the discount's weight, and g the derivative of the information. Derivatives are finite
+differences: each lane of a block rolls out the plan with one input perturbed. The smaller λ, the longer the step. For
+one λ after another, the next step is the last one after one more Newton iteration, within the largest input. The steps
+are then evaluated.
 """
 
 from __future__ import annotations
@@ -23,30 +23,35 @@ from agents.planning.d_optimality import half_log_det, solve_from_cholesky
 from estimator.compilation.array_operations import copy, fill
 from estimator.compilation.simd import LANES, jit
 
-#: Inputs of a plan that are changed together; later ones are planned again before they are played.
+#: First inputs of a plan that change together; later ones are planned anew before they are played.
 _MAX_CHANGED_INPUTS = 20
 
-#: Steps; how much smaller λ becomes from step to step; and the last λ: with it g alone asks for at most this many times
-#: the largest input that there is.
-_N_STEPS, _DAMPING_RATIO, _MAX_STEP = 16, 1.6, 2.0
+#: Number of steps.
+_N_STEPS = 16
 
-#: How far an input is nudged, in parts of the largest.
+#: Ratio of λ from step to step.
+_DAMPING_RATIO = 1.6
+
+#: Step that g alone takes with the last λ, in parts of the largest input.
+_MAX_STEP = 2.0
+
+#: Perturbation of an input for finite differences, in parts of the largest.
 _DIFFERENCE_FRACTION = 1e-3
 
-#: Outputs that are further from their margin than so many standard deviations are not in the model.
+#: Standard deviations from the margin beyond which outputs are left out of the model.
 _MAX_MODELLED_EXCESS = 12.0
 
 
 class CandidateBatch(NamedTuple):
-    """Plans that compete, one in each lane, and what is known of them.
+    """Candidate plans, one in each lane, and their evaluation.
 
     Attributes:
         candidates: (LANES, horizon) the plans.
-        scores: (LANES,) what they are worth.
-        margin_excess: (horizon, LANES) standard deviations by which the output of a move is within its margin.
-        weights: (horizon,) how much what a move teaches and costs counts.
-        plan: (horizon,) the one that was nudged.
-        perturbations: (`_MAX_CHANGED_INPUTS`,) of its inputs; that of input i is in lane i + 1.
+        scores: (LANES,) of the plans [nats].
+        margin_excess: (horizon, LANES) standard deviations by which a move's output is within its margin.
+        weights: (horizon,) of the discount.
+        plan: (horizon,) the plan that was perturbed.
+        perturbations: (`_MAX_CHANGED_INPUTS`,) of its inputs; lane i + 1 has input i perturbed.
     """
 
     candidates: Any
@@ -59,7 +64,7 @@ class CandidateBatch(NamedTuple):
 
 @jit
 def empty_candidate_batch(horizon):
-    """Memory for plans of so many moves."""
+    """Memory for plans of ``horizon`` moves."""
     candidates, margin_excess = np.empty((LANES, horizon)), np.empty((horizon, LANES))
     return CandidateBatch(
         candidates, np.empty(LANES), margin_excess, np.empty(horizon), np.empty(horizon), np.empty(_MAX_CHANGED_INPUTS)
@@ -68,9 +73,9 @@ def empty_candidate_batch(horizon):
 
 @jit
 def fill_finite_differences(batch, plan, n_moves, amplitude):
-    """Put the plan into the first lane, and with one input nudged towards its middle into each lane after it.
+    """Put the plan into the first lane, and copies with one input perturbed towards 0 into the lanes after it.
 
-    Gives the first lane that is left.
+    Returns the first free lane.
     """
     candidates, n_changed = batch.candidates, min(n_moves, _MAX_CHANGED_INPUTS)
     copy(batch.plan, 0, plan, len(plan))
@@ -86,7 +91,7 @@ def fill_finite_differences(batch, plan, n_moves, amplitude):
 
 @jit
 def fill_newton_candidates(batch, n_moves, amplitude):
-    """Put the plan that was nudged, with one step each, into the first lanes; gives the first lane that is left."""
+    """Put the perturbed plan after each of the steps into the first lanes; return the first free lane."""
     candidates, scores, margin_excess, weights, plan, differences = batch
     n = min(n_moves, _MAX_CHANGED_INPUTS)
     g, d, slope = np.empty(n), np.zeros(n), np.empty(n)
@@ -104,7 +109,7 @@ def fill_newton_candidates(batch, n_moves, amplitude):
             rows[count] = h
             for i in range(n):
                 Z[count, i] = (margin_excess[h, i + 1] - margin_excess[h, 0]) / differences[i] if i <= h else 0.0
-                # The worth has what the margin costs in it; g is without.
+                # The score contains the cost of the margin; g does not.
                 g[i] += 4.0 * MARGIN_COST * weights[h] * max(0.0, margin_excess[h, 0]) ** 3 * Z[count, i]
             count += 1
     for s in range(_N_STEPS):
@@ -123,7 +128,7 @@ def fill_newton_candidates(batch, n_moves, amplitude):
                     slope[i] -= 4.0 * cost * z * Z[r, i]
                     for k in range(i + 1):
                         H[i, k] += 12.0 * cost * Z[r, i] * Z[r, k]
-        # What the amplitude holds stays; the others move up to the front.
+        # Inputs held by the amplitude limit stay; the free ones are packed to the front.
         m = 0
         for i in range(n):
             moved_input = plan[i] + d[i]

@@ -1,14 +1,15 @@
-"""Climbing the worth of an input under the limits of an experiment, compiled for any model.
+"""Projected gradient ascent of the D-optimality under input, output and energy limits, compiled for any model.
 
-The method is a projected gradient with steps of given length: u ← P(u + α R g / |g|), with P the projection on the
-limits and R the radius of what they allow. For long steps it is the generalised power method, which under a limit of
-energy is at a summit within some ten steps: information is about quadratic in the input, as a Rayleigh quotient is.
+A step has a given length: u ← P(u + α R g / |g|), with P the projection on the limits and R the radius of the inputs
+that they allow. For long steps this is the generalised power method, which under a limit of energy converges within
+some ten steps: the information is about quadratic in the input, as a Rayleigh quotient is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,24 +18,24 @@ from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import jit, jit_closure, kernel
 from estimator.models.model import Model
 
-#: The gradient aims at this much of the displacement limit, so that what it ends with is within the limit itself.
+#: Soft limit in parts of the output's limit, so that an ascent ends within the limit itself.
 _SOFT_LIMIT_FRACTION = 0.9995
 
-#: Penalty [nats] of displacements beyond that, see `agents.planning.d_optimality`.
+#: Penalty [nats] of outputs beyond the soft limit (`agents.planning.d_optimality`).
 EXCESS_PENALTY = 3e3
 
-#: The last step in parts of the first.
+#: Length of the last step in parts of the first.
 _FINAL_STEP_FRACTION = 0.05
 
 
 class DesignLimits(NamedTuple):
-    """What inputs must keep, and what climbing aims at.
+    """The limits of inputs and of their response.
 
     Attributes:
-        output: limit of the first sensor's signal without noise, in its unit; inf where there is none.
-        soft_limit: signals beyond this one are penalised.
+        output: limit of the first sensor's signal without noise, in its unit; inf for none.
+        soft_limit: of the signal, beyond which it is penalised.
         amplitude: limit of the input.
-        energy: limit of Σ u², inf where there is none.
+        energy: limit of Σ u²; inf for none.
     """
 
     output: float
@@ -47,27 +48,29 @@ class ProjectedGradient(NamedTuple):
     """Compiled functions of one model and interpolation of the input.
 
     Attributes:
-        ascend_batch: ``ascend_batch(nominal, limits, rate, iterations, inputs, values)``: improve several inputs (starts, T) of one
-            system from rest, each on its own; overwritten by the best found that keeps all limits. ``values`` (starts,)
-            receives their worth [nats], -inf where nothing found keeps them. ``limits.aim`` is not used.
-        ascend: ``ascend(nominal, limits, rate, iterations, start, u, best, workspace)``: climb from u (T,); the best input
-            met overwrites it, that is the most worth, less the penalty, of those within ``limits.output``. Gives that
-            worth [nats]. ``best`` (T,) is written on.
-        evaluate_batch: ``evaluate_batch(coefficients, precision, noises, limit, inputs, values, peaks)``: worth [nats] and peak of
-            an input (n, T) for each system (n, K), without a penalty. An input ends before its first value that is not
-            finite.
+        ascend_batch: ``ascend_batch(nominal, limits, first_step, iterations, inputs, values)`` improves several inputs
+            (starts, T) of one system from rest, each by itself, and overwrites them by the best found within all
+            limits. ``values`` (starts,) receives their criterion [nats]; -inf where none was found. The soft limit of
+            ``limits`` has no effect.
+        ascend: ``ascend(nominal, limits, first_step, iterations, start, u, best, workspace)`` ascends from u (T,), and
+            overwrites u by the best input found within ``limits.output``. It returns that input's criterion, less the
+            penalty [nats]. ``best`` (T,) is memory.
+        evaluate_batch: ``evaluate_batch(coefficients, precision, noises, limit, inputs, values, peaks)`` fills in the
+            criterion [nats], without a penalty, and the peak of an input (n, T) of each system (n, K). An input ends
+            before its first value that is not finite.
 
-        ``rate`` is the first step α; the steps fall linearly to a twentieth. ``iterations`` are those of the gradient.
+        ``first_step`` is α of the first step; steps shrink linearly to a twentieth. ``iterations`` counts gradient
+        steps.
     """
 
-    ascend_batch: Any
-    ascend: Any
-    evaluate_batch: Any
+    ascend_batch: Callable[..., None]
+    ascend: Callable[..., float]
+    evaluate_batch: Callable[..., None]
 
 
 @cache
 def compile_projected_gradient(model: Model, degree: int = 0) -> ProjectedGradient:
-    """What climbs the worth of inputs to a model; arguments as `agents.planning.d_optimality.compile_d_optimality`."""
+    """Compile for a model; arguments as `agents.planning.d_optimality.compile_d_optimality`."""
     d_optimality = compile_d_optimality(model, degree)
     criterion_and_gradient, criterion, workspace_for, start_size = (
         d_optimality.criterion_and_gradient,
@@ -135,7 +138,7 @@ def project_input(u, amplitude, energy):
         u[t] = max(-amplitude, min(amplitude, u[t]))
         spent += u[t] * u[t]
     if spent > energy:
-        # A little less, because the square of what is rounded may be above again.
+        # A little less: rounding may raise the energy above its limit again.
         scale = (1.0 - 1e-12) * np.sqrt(energy / spent)
         for t in range(len(u)):
             u[t] *= scale
