@@ -1,5 +1,4 @@
-"""Candidate inputs of the search: shifted last plans, allowed inputs, random mutations, and the slew limit.
-"""
+"""Candidate inputs of the search: shifted last plans, allowed inputs, random mutations, and the slew limit."""
 
 from __future__ import annotations
 

@@ -39,7 +39,8 @@ class NominalSystem(NamedTuple):
     Attributes:
         coefficients: (K,) of the model.
         precision: (K, K) Λ.
-        noises: variances of the process noise and of each sensor's (`estimator.inference.record_filter.noise_variances`).
+        noises: variances of the process noise and of each sensor
+            (`estimator.inference.fisher_information.noise_variances`).
     """
 
     coefficients: FloatArray

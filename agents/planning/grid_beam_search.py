@@ -1,21 +1,22 @@
-"""The best ways through the map of a model's state, compiled: a plan, built move by move.
+"""Beam search on a grid of a model's state, compiled: a plan of inputs, built move by move.
 
-As by dynamic programming, of all ways that lead into the same cell of the plane of the first two states only the best
-is followed; and of these, so many of the best. So a long plan is found in the time of a short one. A way goes on with
-the highest input, the lowest, none, and half of either, since near its limit a signal may be led too far by a whole
-push and not far enough by none. In its first moves, which will be played, quarters are tried, too. Far ahead, where the
-plan will be made anew, only the highest and the lowest are, and fewer ways are followed.
-A way's score is what it has taught together with what the rest of the episode will teach anyway, at the rate of the
-last plans. Without the latter a way would be praised for what every way teaches sooner or later.
+As in dynamic programming, of all paths that lead into the same cell of the first two states only the best is kept; and
+of these the best, up to the beam width. So a long plan is found in the time of a short one. A path continues with the
+highest input, the lowest, none, and half of either: near the limit a full push may lead too far, and none not far
+enough. In the first moves, which will be played, quarters are tried as well. Far ahead, where plans will be made anew,
+only the highest and the lowest input are tried, on fewer beams.
+The score of a path is its information together with the information that the rest of the episode is expected to bring,
+at the rate of the last plans. Without the latter, a path would be credited with information that every path gains.
 
-The plane is that of (x_t, x_{t-1}) for Eq. (2), of displacement and velocity for Eq. (1); a model with one state has a
-line. Each state is measured by its size when the first sensor is at its limit (`agents.planning.time_scales.TimeScales`). Other
-states, and older inputs, are followed with their way, and do not tell ways apart.
+The plane is (x_t, x_{t-1}) for Eq. (2), and displacement and velocity for Eq. (1); a model with one state has a line.
+States are in units of their sizes when the first sensor is at its limit (`agents.planning.time_scales.TimeScales`).
+Other states, and older inputs, belong to a path and do not distinguish cells.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -23,23 +24,27 @@ import numpy as np
 
 from agents.planning.belief_rollout import compile_belief_rollout
 from agents.planning.candidate_inputs import INPUT_FRACTIONS, allowed_input, next_uniform
+from agents.planning.plan_objective import PlanObjective
 from estimator.compilation.array_operations import aligned_matrix, copy, index_of_max
 from estimator.compilation.scalar_jit import scalar_jit
 from estimator.compilation.simd import LANES, jit, jit_closure, lanewise
 from estimator.engine.expected_update import compile_expected_update
 from estimator.models.model import Model
+from estimator.support.array_types import FloatArray
 
-#: Where not all inputs are tried, so many are, and far ahead so many.
-_N_INPUTS_NEAR, _N_INPUTS_FAR = 5, 2
+#: Inputs of a move after those for which all are tried.
+_N_INPUTS_NEAR = 5
 
-#: Sizes that are tried of a first input whose direction is given and that is held for one sample, in parts of the
-#: largest.
+#: Inputs of a move far ahead.
+_N_INPUTS_FAR = 2
+
+#: Sizes of a first input whose direction is given and that is held for one sample, in parts of the largest.
 _FIRST_INPUT_SIZES = (1.0, 0.75, 0.5, 0.25)
 
-#: A way this much [nats] worse than the best of its length is followed no further.
+#: Distance [nats] from the best path of the same length beyond which a path is dropped.
 _PRUNE_GAP = 0.5
 
-#: Halvings of that in which a score is searched that no more than so many ways reach.
+#: Bisections of that distance for the score that no more paths than the beam width reach.
 _N_BISECTIONS = 12
 
 
@@ -47,28 +52,28 @@ class GridBeamSearch(NamedTuple):
     """Compiled functions of one model.
 
     Attributes:
-        workspace: ``workspace(horizon, beam_width)``: a `BeamWorkspace` for plans of so many moves and so many ways, which are a multiple
-            of `LANES`.
-        find_best_plan: ``find_best_plan(workspace, task, found, rng_state)``: the best way, a plan ``found`` (horizon,). The map is laid anew at
-            random every time.
+        workspace: ``workspace(horizon, beam_width)`` makes a `BeamWorkspace` for plans of ``horizon`` moves; the beam
+            width is a multiple of `LANES`.
+        find_best_plan: ``find_best_plan(workspace, problem, plan, rng_state)`` fills in the best plan (horizon,). The
+            grid has a random offset each time.
     """
 
-    workspace: Any
-    find_best_plan: Any
+    workspace: Callable[..., Any]
+    find_best_plan: Callable[..., None]
 
 
 class BeamWorkspace(NamedTuple):
-    """What is written on.
+    """Memory of one search.
 
     Attributes:
-        beams: blocks of the ways that are followed.
+        beams: blocks of the paths that are followed.
         continuations: blocks of their continuations.
-        parents: (horizon, ways) of which way each continues.
-        inputs: (horizon, ways) with which input.
-        scores: (len(`CHOICES`) ways,) of the best continuations into the cells that any leads into.
-        best_continuations: (len(`CHOICES`) ways,) which these are.
-        visited_cells: (len(`CHOICES`) ways,) which cells.
-        source_offsets: (ways,) where the continuations begin that become ways.
+        parents: (horizon, beams) the path that each one continues.
+        inputs: (horizon, beams) the input with which it does.
+        scores: (len(`INPUT_FRACTIONS`) beams,) of the best continuation into each visited cell.
+        best_continuations: (len(`INPUT_FRACTIONS`) beams,) these continuations.
+        visited_cells: (len(`INPUT_FRACTIONS`) beams,) these cells.
+        source_offsets: (beams,) where the continuations that become beams begin.
     """
 
     beams: Any
@@ -82,7 +87,7 @@ class BeamWorkspace(NamedTuple):
 
 
 class SearchProblem(NamedTuple):
-    """What is searched for, of one environment.
+    """The problem of one decision in one environment.
 
     Attributes:
         record: the belief.
@@ -91,23 +96,23 @@ class SearchProblem(NamedTuple):
         hold_samples: samples of a move.
         objective: `agents.planning.plan_objective.PlanObjective`.
         previous_inputs: (2,) the inputs that were applied last, newest first.
-        information_factor: (K, K) factor of the information per sample that is to come.
-        cells: of the map along each axis.
+        information_factor: (K, K) factor of the expected information per sample of the rest of the episode.
+        cells: of the grid along each axis.
         n_moves_all_inputs: moves for which all inputs are tried.
-        n_moves_some_inputs: moves up to which whole and half ones are; then the highest and the lowest alone.
-        beam_width: that are followed, at most.
-        far_beam_width: of these, beyond ``n_moves_some_inputs`` moves.
-        first_direction: where the first input goes: 1.0 up, -1.0 down, 0.0 there is none, NaN anywhere.
-        mirror_sign: -1.0 turns the map over.
+        n_moves_some_inputs: moves up to which whole and half inputs are tried; then the highest and the lowest alone.
+        beam_width: paths that are followed, at most.
+        far_beam_width: the same beyond ``n_moves_some_inputs`` moves.
+        first_direction: of the first input: 1.0 up, -1.0 down, 0.0 none, NaN any.
+        mirror_sign: -1.0 mirrors the grid.
     """
 
-    record: Any
+    record: FloatArray
     samples_left: int
     n_moves: int
     hold_samples: int
-    objective: Any
-    previous_inputs: Any
-    information_factor: Any
+    objective: PlanObjective
+    previous_inputs: FloatArray
+    information_factor: FloatArray
     cells: int
     n_moves_all_inputs: int
     n_moves_some_inputs: int
@@ -118,16 +123,10 @@ class SearchProblem(NamedTuple):
 
 
 @cache
-def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> GridBeamSearch:
-    """The ways through the map of a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
+def _compile_selection(model: Model, degree: int, lag: int) -> tuple[Any, Any]:
+    """``workspace``, as `GridBeamSearch`, and ``select_beams``."""
     rollout = compile_belief_rollout(model, degree, lag)
-    size, n_carried, U, SCORE = rollout.size, rollout.n_carried, rollout.input_row, rollout.score_row
-    load_belief, advance, evaluate = rollout.load_belief, rollout.advance, rollout.evaluate
-    states = {"FIRST": 0, "SECOND": 1, "CELL": compile_expected_update(model, degree, lag).layout["CELL"]}
-    CELL = states["CELL"] * LANES
-    in_line = lanewise(states, "CELL", uniform="mirror_sign offset_x cells scale")(_cell_on_line)
-    in_plane = lanewise(states, "CELL", uniform="mirror_sign offset_x offset_y cells scale scale_y")(_cell_in_plane)
-    is_plane = model.n_states > 1
+    size, n_carried, U = rollout.size, rollout.n_carried, rollout.input_row
     compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
 
     @compile_inner
@@ -150,9 +149,9 @@ def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> Gri
 
     @compile_inner
     def select_beams(memory, h, most, found):
-        """Make the best of the continuations the new ways, and note where they come from; gives their number.
+        """Make the best continuations, of ``found`` visited cells, the new beams; return their number.
 
-        Into ``found`` cells leads any; the scores become those of the ways.
+        Their parents and inputs are stored, and their scores come first.
         """
         beams, continuations, parents, inputs, scores, best_continuations, _, source_offsets = memory
         threshold = score_threshold(scores[:found], most)
@@ -164,7 +163,7 @@ def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> Gri
                 inputs[h, count] = continuations[b, U + j]
                 scores[count], source_offsets[count] = scores[i], b * size + j
                 count += 1
-        # Lanes beyond the last way do the same work as the others, so that none of them runs wild.
+        # Lanes beyond the last beam repeat others, so that their numbers stay finite.
         for lane in range(count, -(-count // LANES) * LANES):
             source_offsets[lane] = source_offsets[lane // LANES * LANES]
         flat_values = continuations.reshape(-1)
@@ -174,16 +173,33 @@ def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> Gri
                     beams[block, row + lane] = flat_values[source_offsets[block * LANES + lane] + row]
         return count
 
+    return workspace, select_beams
+
+
+@cache
+def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> GridBeamSearch:
+    """Compile for a model; arguments as `estimator.engine.expected_update.compile_expected_update`."""
+    rollout = compile_belief_rollout(model, degree, lag)
+    n_carried, U, SCORE = rollout.n_carried, rollout.input_row, rollout.score_row
+    load_belief, advance, evaluate = rollout.load_belief, rollout.advance, rollout.evaluate
+    workspace, select_beams = _compile_selection(model, degree, lag)
+    states = {"FIRST": 0, "SECOND": 1, "CELL": compile_expected_update(model, degree, lag).layout["CELL"]}
+    CELL = states["CELL"] * LANES
+    in_line = lanewise(states, "CELL", uniform="mirror_sign offset_x cells scale")(_cell_on_line)
+    in_plane = lanewise(states, "CELL", uniform="mirror_sign offset_x offset_y cells scale scale_y")(_cell_in_plane)
+    is_plane = model.n_states > 1
+    compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
+
     @compile_inner
     def find_best_plan(memory, problem, found, rng_state):
-        """Build a plan by the best ways into the cells of the map, which is laid anew at random every time."""
+        """Fill in the best plan, on a grid with a random offset."""
         beams, continuations, parents, inputs, scores, best_continuations, visited_cells, _ = memory
         record, objective, information_factor, hold_samples = (
             problem.record,
             problem.objective,
             problem.information_factor,
             problem.hold_samples,
-        )  # once: each time they would be counted
+        )  # once: Numba counts references at each access
         cell_entries = np.full(problem.cells * problem.cells if is_plane else problem.cells, -1)
         offset_x, offset_y = next_uniform(rng_state), next_uniform(rng_state)
         load_belief(beams[0], record, problem.previous_inputs)
@@ -248,13 +264,13 @@ def compile_grid_beam_search(model: Model, degree: int = 0, lag: int = 0) -> Gri
 
 @jit
 def first_input(size_index, problem):
-    """One of the first inputs in the direction that is given."""
+    """An input in the direction of the problem, of one of `_FIRST_INPUT_SIZES`."""
     return problem.first_direction * _FIRST_INPUT_SIZES[size_index] * problem.objective.amplitude
 
 
 @jit
 def score_threshold(scores, max_count):
-    """A score that no more than ``max_count`` of them reach, but where more are the highest, and none that is hopeless."""
+    """A score within `_PRUNE_GAP` of the best that at most ``max_count`` scores reach, unless more tie for the best."""
     high = scores[index_of_max(scores, len(scores))]
     low = high - _PRUNE_GAP
     if _count_reaching(scores, low) <= max_count:
@@ -270,7 +286,7 @@ def score_threshold(scores, max_count):
 
 @jit
 def _count_reaching(scores, threshold):
-    """How many scores are as high or higher."""
+    """Number of scores at or above the threshold."""
     count = 0
     for i in range(len(scores)):
         count += scores[i] >= threshold
@@ -279,18 +295,18 @@ def _count_reaching(scores, threshold):
 
 @scalar_jit
 def _axis_cell(x, scale, cells, offset):
-    """The cell along one axis; the first for a state that is not a number."""
+    """The cell along one axis; the first one for NaN."""
     position = (x / scale + 1.0) * 0.5 * (cells - 1) + offset
     return math.floor(min(position, cells - 1.0)) if position > 0.0 else 0.0
 
 
 def _cell_on_line(FIRST, mirror_sign, offset_x, cells, scale):
-    """The cell of a state of one number."""
+    """The cell of a single state."""
     return _axis_cell(mirror_sign * FIRST, scale, cells, offset_x)
 
 
 def _cell_in_plane(FIRST, SECOND, mirror_sign, offset_x, offset_y, cells, scale, scale_y):
-    """The cell of a state, of which the first two numbers count."""
+    """The cell of the first two states."""
     return _axis_cell(mirror_sign * FIRST, scale, cells, offset_x) * cells + _axis_cell(
         mirror_sign * SECOND, scale_y, cells, offset_y
     )

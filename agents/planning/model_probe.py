@@ -1,6 +1,6 @@
-"""What policies read off an observation, of any model: coefficients and states, resonance, velocity, sizes of states.
+"""Properties of a believed model that policies and planners read: layout of observations, resonance, linearisation.
 
-Time is counted in samples: a frequency is in cycles per sample, a velocity in what the first sensor changes by in one.
+Time is counted in samples: a frequency is in cycles per sample, a velocity in change of the first sensor per sample.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from estimator.support.array_types import FloatArray
 
 
 class ModelView(NamedTuple):
-    """How a policy takes the model of an experiment.
+    """The model of an experiment, with the timing of its input.
 
     Attributes:
-        model: that is believed.
+        model: of the belief.
         degree: of the input over a sample of a differential equation.
-        lag: 1 where a difference equation takes every input a sample later.
+        lag: 1 for a difference equation that takes every input a sample later.
     """
 
     model: Model
@@ -35,10 +35,10 @@ class ModelView(NamedTuple):
 
     @classmethod
     def of(cls, experiment: Any) -> ModelView:
-        """That of an experiment of duffing_env.
+        """The view of an experiment of duffing_env.
 
         On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
-        begin of a sample, as the environment feeds it (`duffing_env.kernel_stages.env_codegen`).
+        start of a sample, as the environment feeds it (`duffing_env.kernel_stages.env_codegen`).
         """
         model = experiment.model
         if model.is_continuous:
@@ -47,12 +47,12 @@ class ModelView(NamedTuple):
 
     @property
     def compile_key(self) -> str:
-        """What tells the functions compiled for it from those for others (`estimator.compilation.simd.jit_closure`)."""
+        """Distinguishes the functions compiled for this view (`estimator.compilation.simd.jit_closure`)."""
         return f"{self.model.name}_{self.model.digest}_{self.degree}_{self.lag}"
 
 
 class ObservationLayout(NamedTuple):
-    """Where the entries of an observation begin.
+    """Places of the entries of an observation.
 
     Attributes:
         mean: of the coefficients' means.
@@ -81,7 +81,7 @@ class ObservationLayout(NamedTuple):
 
 @cache
 def observation_layout(model: Model) -> ObservationLayout:
-    """Where the entries of a model's observation begin."""
+    """Places of the entries of a model's observation."""
     at = {name: i for i, name in enumerate(observation_bounds(model))}
     k, state, sensor = model.n_coefficients, next(iter(model.states)), next(iter(model.outputs))
     return ObservationLayout(
@@ -91,14 +91,14 @@ def observation_layout(model: Model) -> ObservationLayout:
 
 
 class LocalDynamics(NamedTuple):
-    """What n systems do by themselves, at given states.
+    """Outputs and linearisations of n systems at given states.
 
     Attributes:
-        outputs_shown: (n,) what the first sensor shows.
-        velocities: (n,) its velocity.
+        outputs_shown: (n,) outputs of the first sensor.
+        velocities: (n,) their velocities.
         input_gains: (n,) the gain (`estimator.engine.noise_free_response`).
         jacobians: (n, states, states) of the linear part.
-        regressors: (n, K) derivatives of a sample's moves by the coefficients, under an input that is on.
+        regressors: (n, K) derivatives of the motion over a sample by the coefficients.
     """
 
     outputs_shown: FloatArray
@@ -143,12 +143,12 @@ def _compile_local_dynamics(model: Model) -> Any:
 
 
 def local_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> LocalDynamics:
-    """What systems do, at states and under an input.
+    """Outputs and linearisations of systems at states and under an input.
 
     Args:
-        model: of all.
+        model: of all systems.
         means: (n, K) their coefficients.
-        states: (n, states) where they are.
+        states: (n, states) their states.
         u: the input.
     """
     coefficient_rows = np.ascontiguousarray(np.atleast_2d(means), dtype=np.float64)
@@ -161,7 +161,7 @@ def local_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u:
 
 
 def resonance_frequencies(model: Model, jacobians: FloatArray) -> FloatArray:
-    """(n,) the frequencies in cycles per sample at which linear parts ring: the highest, or 0 where one does not."""
+    """(n,) resonances of linear parts in cycles per sample: the highest, or 0 where a part does not oscillate."""
     poles = np.linalg.eigvals(jacobians)
     angles = np.abs(poles.imag if model.is_continuous else np.where(poles.imag != 0, np.angle(poles), 0.0))
     highest: FloatArray = angles.max(axis=-1) / (2.0 * np.pi)
@@ -169,7 +169,7 @@ def resonance_frequencies(model: Model, jacobians: FloatArray) -> FloatArray:
 
 
 def believed_resonance(belief: Belief) -> float:
-    """Cycles per sample at which a believed system rings in small motions: of two wells, at the bottom of one."""
+    """Resonance of a believed system for small motions, in cycles per sample; with two wells, in one of them."""
     means = belief.coefficients_mean
     found = local_dynamics(belief.model, means, np.zeros(belief.model.n_states))
     cycles = float(resonance_frequencies(belief.model, found.jacobians)[0])
@@ -180,10 +180,10 @@ def believed_resonance(belief: Belief) -> float:
 
 
 def sampled_peak_fraction(belief: Belief, amplitude: float) -> float:
-    """The part of a peak that samples see at least, of a believed oscillator that swings by a displacement."""
+    """The least part of a peak that samples catch, for a believed oscillator of this amplitude."""
     means = dict(zip(belief.names, belief.coefficients_mean, strict=True))
     square = means.get("stiffness", 0.0) + 0.75 * means.get("cubic", 0.0) * amplitude**2
-    # Half a sample from the peak; and no worse than at six samples a period.
+    # Half a sample from the peak, and no worse than with six samples per period.
     return float(np.cos(min(np.sqrt(max(square, 0.0)) / 2, np.pi / 6)))
 
 
@@ -193,11 +193,11 @@ def is_on_rig(experiment: Any) -> bool:
 
 
 def planning_limit(experiment: Any, state_scales: FloatArray) -> float:
-    """The limit that plans keep in an experiment: on a rig less than its own, by what a swing hides between samples.
+    """The limit that plans keep; on a rig it is lower by the part of a peak that falls between samples.
 
     Args:
         experiment: of duffing_env.
-        state_scales: (states,) when the first sensor is at its limit.
+        state_scales: (states,) sizes of the states when the first sensor is at its limit.
     """
     limit = float(experiment.kernel_params.max_output)
     return (

@@ -17,32 +17,34 @@ from estimator.compilation.simd import kernel
 from estimator.engine.noise_free_response import compile_noise_free_response
 from estimator.support.array_types import FloatArray
 
-#: Samples of the motion by which a system is measured, and where it turns, in parts of the limit.
-_N_PROBE_SAMPLES, _TURN_FRACTION = 128, 0.95
+#: Samples of the motion by which a system is measured.
+_N_PROBE_SAMPLES = 128
 
-#: The part of what a believed system's input moves that plans count on.
+#: Output at which the motion turns, in parts of the limit.
+_TURN_FRACTION = 0.95
+
+#: Part of a believed step response that plans count on.
 _RELIABLE_STEP_FRACTION = 0.75
 
-#: Moves of the input in a period of the motion: fewer cannot follow it, more take time and look less far.
+#: Moves of the input per period of the motion: fewer cannot follow it, more take time and shorten the horizon.
 MOVES_PER_PERIOD = 9
 
 
 class TimeScales(NamedTuple):
-    """How a system swings when it is pumped up along its velocity, and turned before the limit.
+    """Time scales of an oscillation that is pumped up along its velocity and turned before the limit.
 
     Attributes:
-        scales: (states,) sizes of the states when the first sensor is at its limit. The sensor's own state, and one
-            that keeps its last value, have the limit itself. Others, such as a velocity, have the limit times the ratio
-            of their peak to the sensor's. So they have no unit of their own to go wrong by, and are right where the
-            limit is out of reach, too.
-        hold_samples: samples that a planned input is held for, so that a plan of some moves looks some periods ahead also
-            where there are many samples in a period.
-        accumulated_noise: variance by which process noise moves the first sensor in a quarter of a period, in parts of what it
-            does to the displacement in a sample, less that sample's own. Nothing done within this time takes it back.
-        mean_information: (K, K) the mean of φ φᵀ over the samples, with φ the derivatives by the coefficients of what the first
-            sensor shows a sample later.
-        rise_time: samples until it comes near the limit; inf where it does not within `_N_PROBE_SAMPLES`.
-        step_response: by how much an input of 1 over a sample from rest moves what the first sensor shows after it.
+        scales: (states,) sizes of the states when the first sensor is at its limit. The sensor's own state, and a state
+            that keeps its last value, have the limit itself. Another, such as a velocity, has the limit times the ratio
+            of its peak to the sensor's: a scale without a unit of its own, valid also where the limit is out of reach.
+        hold_samples: samples for which a planned input is held, so that a plan covers some periods also where a period
+            has many samples.
+        accumulated_noise: variance by which process noise moves the first sensor in a quarter of a period, in parts of
+            its variance of the displacement per sample, less that sample's own. No input corrects it within this time.
+        mean_information: (K, K) mean of φ φᵀ over the samples, with φ the derivatives of the first sensor's output a
+            sample later by the coefficients.
+        rise_time: samples until the output comes near the limit; inf where it does not within `_N_PROBE_SAMPLES`.
+        step_response: change of the first sensor's output after a sample from rest, per unit of the input.
     """
 
     scales: FloatArray
@@ -55,10 +57,10 @@ class TimeScales(NamedTuple):
 
 @cache
 def _compile_pumped_swing(view: ModelView) -> Any:
-    """``time_scales(means, max_input, limit, peaks, mean_information)`` fills `TimeScales.mean_information`, and what the others are made of.
+    """``swing(means, max_input, limit, peaks, mean_information)`` fills in `TimeScales.mean_information` and ``peaks``.
 
-    These are the peaks of states and sensor, samples in a period, or 0, samples until the limit is near, or 0, and how
-    far the largest input moves what the first sensor shows after a sample from rest.
+    These are the peaks of states and sensor, the samples in a period or 0, the samples until the limit is near or 0,
+    and the change of the first sensor's output by the largest input over a sample from rest.
     """
     free_response = compile_noise_free_response(*view)
     at, sense, glance, step = (
@@ -70,7 +72,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
     u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
-    # What pumps is a push along the motion itself: along what an accelerometer sees rise, it would brake.
+    # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)
     velocity = at[rate] if rate in states else velocity
 
@@ -116,7 +118,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
 
 
 def probe_time_scales(view: ModelView, prior_means: npt.ArrayLike, max_input: float, limit: float) -> TimeScales:
-    """How the prior's means swing.
+    """Measure the time scales of the system at the prior's means.
 
     Args:
         view: of the model.
@@ -149,18 +151,18 @@ def probe_time_scales(view: ModelView, prior_means: npt.ArrayLike, max_input: fl
 
 
 def kept_accumulated_noise(experiment: Any, time_scales: TimeScales) -> float:
-    """`TimeScales.accumulated_noise`, where plans keep that from the limit besides what the last output may tell; else 0.
+    """`TimeScales.accumulated_noise`, where plans keep it from the limit; else 0.
 
-    On a rig they do. With several sensors, too: the others tell of a kick before the first one shows it.
+    They do on a rig, and with several sensors: the others show a disturbance before the first one does.
     """
     return time_scales.accumulated_noise if is_on_rig(experiment) or experiment.model.n_outputs > 1 else 0.0
 
 
 def recoverable_step(experiment: Any, view: ModelView, time_scales: TimeScales) -> float:
-    """What of `TimeScales.step_response` plans count on to make up for what the output before tells (`Terms.recoverable_step`); 0 for none.
+    """The part of `TimeScales.step_response` that plans count on (`PlanObjective.recoverable_step`); 0 for none.
 
-    None where an input acts in full only a sample later, is held or changed slowly, or has little energy, where another
-    sensor tells of a kick before the first one shows it, and on a rig, where leaving the limit may cost more than
+    None where an input acts in full only a sample later, is held or slew-limited, or has little energy, where another
+    sensor shows a disturbance before the first one does, and on a rig, where leaving the limit may cost more than
     information.
     """
     setup = experiment.kernel_params

@@ -1,6 +1,6 @@
-"""The planner in blocks reads its environment's belief and model, and is no function of the observation.
+"""Planner of blocks: inputs of several samples at once, chosen on the belief before any of their outputs is observed.
 
-It decides on a whole block of inputs at once, and sees their outputs when all were played.
+It reads the belief and the model of its environment, and is no function of the observation.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from agents.policies.efe_planner import EfePlanner
 from estimator.support.argument_checks import check_integer
 from estimator.support.array_types import FloatArray
 
-#: Moves after a block that are planned with it, so that it ends where the next can go on.
+#: Moves after a block that are planned with it, so that the next block can continue.
 _LOOKAHEAD_MOVES = 9
 
-#: Of these, those that must be safe, too: what a block has begun the next one can stop only then.
+#: First of these moves that must be safe as well: the next block cannot stop an oscillation sooner.
 _SAFE_LOOKAHEAD_MOVES = 3
 
 #: Samples of a block, at most.
 _MAX_BLOCK = 4096
 
-#: The least probability that is counted in draws. A smaller one is that of draws with larger deviations.
+#: Least probability that is counted in draws; smaller ones are counted in draws with larger deviations.
 _MIN_COUNTED_PROBABILITY = 5e-4
 
 
 def countable_probability(probability: float) -> tuple[float, float]:
-    """A probability that can be counted in draws, and by how much these must deviate more than believed.
+    """A probability that can be counted in draws, and the factor of their deviations.
 
-    What is beyond so many standard deviations of a Gaussian is as probable in the belief as asked, if it has the
-    probability that is returned in these draws:
+    An event beyond a number of standard deviations of a Gaussian has the asked probability in the belief if it has the
+    returned probability in draws with these deviations:
 
     >>> countable_probability(0.01)
     (0.01, 1.0)
@@ -59,12 +59,12 @@ def countable_probability(probability: float) -> tuple[float, float]:
 
 
 class BlockPlannerState(NamedTuple):
-    """What `BlockPlanner.predict` goes on from, of n environments.
+    """The state of `BlockPlanner.predict` for n environments.
 
     Attributes:
         plans: (n, block) the blocks.
         n_played: (n,) samples of these that were played.
-        samples_left: (n,) samples that were left of the episodes; where more are left now, another one has begun.
+        samples_left: (n,) samples left in the episodes; where more are left now, another one has begun.
     """
 
     plans: FloatArray
@@ -73,19 +73,20 @@ class BlockPlannerState(NamedTuple):
 
 
 class BlockPlanner:
-    """Planning a block at a time on an environment's belief and model; it is no function of the observation.
+    """Planner of a block at a time on the belief and the model of an environment; no function of the observation.
 
-    It minimises expected free energy (`agents.planning.open_loop.chance_constrained_block`), in the environment that it was made for, as `Planner`.
+    It minimises expected free energy (`agents.planning.open_loop.chance_constrained_block`) in the environment that it
+    was made for, as `EfePlanner`.
 
     Args:
-        env: as of `agents.policies.efe_planner.EfePlanner`.
-        seed: of the search, and of the systems that are drawn.
+        env: as of `EfePlanner`.
+        seed: of the search and of the draws.
         block: samples of a block.
         risk: probability, as believed, that an episode leaves its range. Blocks share half of it equally. Of the other
-            half each takes half of what is left, for the first ones know least, and the last one all.
+            half each block takes half of the rest, as the first ones have the widest beliefs, and the last one takes all.
 
     Raises:
-        ValueError: as `Planner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
+        ValueError: as `EfePlanner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above
             4,096; where the input's energy is limited; or for a model whose process noise acts on another state than
             its input does.
     """
@@ -101,7 +102,7 @@ class BlockPlanner:
         setup = env.experiment.kernel_params
         if np.isfinite(setup.budget):
             raise ValueError(f"env must have no limit of energy for blocks, but has max_rms={env.experiment.max_rms!r}")
-        noise_as_input(self._planner.model_view.model)  # refuses what cannot be simulated
+        noise_as_input(self._planner.model_view.model)  # raises where it cannot be simulated
         self._env, self.block, self._risk = env, int(block), risk
         self._limit = float(setup.max_output)
 
@@ -112,14 +113,14 @@ class BlockPlanner:
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], BlockPlannerState]:
-        """The next inputs of the blocks, which are planned where one is at its end; as `Planner.predict`."""
+        """The next inputs of the blocks; a new block is planned where one is at its end; as `EfePlanner.predict`."""
         rows, episode_begins = self._planner.checked_rows(observation, state, BlockPlannerState, episode_start)
         records, n, layout = self._env.records, len(rows), observation_layout(self._planner.model_view.model)
         left = np.rint(rows[:, layout.time_left] * self._env.horizon).astype(np.int64)
         if state is None:
             state = BlockPlannerState(np.zeros((n, self.block)), np.zeros(n, dtype=np.int64), left)
         plans, played = state.plans.copy(), state.n_played.copy()
-        # An episode that is over is shown once more where the next step only begins the next one: no block goes there.
+        # After an episode's end its last observation may come once more: no block is planned for it.
         due = episode_begins | (left >= state.samples_left) | (played >= self.block)
         plans[due], played[due] = 0.0, 0
         for i in np.flatnonzero(due & (left > 0)):
@@ -129,7 +130,7 @@ class BlockPlanner:
         return actions.reshape(*np.shape(observation)[:-1], 1), BlockPlannerState(plans, played + 1, left)
 
     def risk_of_block(self, samples_left: int) -> float:
-        """The part of the risk that the block takes which begins so many samples before the end."""
+        """The risk of the block that begins ``samples_left`` samples before the end."""
         n_begun, blocks = (self._env.horizon - samples_left) // self.block, -(-self._env.horizon // self.block)
         return self._risk * (0.5 / blocks + 0.5 ** (min(n_begun + 1, blocks - 1) + 1))
 
@@ -147,8 +148,9 @@ class BlockPlanner:
         )
         monte_carlo = MonteCarloSystems(view.model, draws, self._limit, rng, degree=view.degree)
         systems = sampled_systems(view, belief, monte_carlo, n_planned, previous_input)
+        guesses = initial_guesses(planner.settings, record, n_planned, int(rng.integers(2**63)))
         u, *_ = optimise_block(
-            view, systems, monte_carlo, initial_guesses(planner.settings, record, n_planned, int(rng.integers(2**63))), objective.amplitude, max_probability,
+            view, systems, monte_carlo, guesses, objective.amplitude, max_probability,
             min(n_planned, samples + _SAFE_LOOKAHEAD_MOVES * objective.hold_samples),
         )  # fmt: skip
         return np.concatenate([u[:samples], np.zeros(self.block - samples)])

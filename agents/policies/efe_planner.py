@@ -1,42 +1,41 @@
-"""The expected free energy planner reads its environment's belief and model, and is no function of the observation.
+"""Expected free energy planner: model-predictive control of the information about the coefficients.
 
-It imagines what candidate inputs would teach, and applies the best one's first. Of a sequence of inputs u over the next
-H samples the expected free energy is, in nats,
+It reads the belief and the model of its environment, and is no function of the observation. It rolls out the belief
+under candidate inputs, and applies the first input of the best plan. The expected free energy of inputs u over the next
+H samples is, in nats,
 
-    G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              what it teaches (epistemic)
-           + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       how far it is from a goal (pragmatic, optional)
-           + input_cost Σ_h u_h²                                        what it costs (optional)
+    G(u) = -[½ log det C_0 - ½ log det (C_H(u)⁻¹ + J)⁻¹]              information gain (epistemic)
+           + Σ_h E[(x_h - goal)²] / (2 goal_std²)                       distance from a goal (pragmatic, optional)
+           + input_cost Σ_h u_h²                                        cost of the input (optional)
 
-with C_0 the covariance of the coefficients now and C_H the one after the H outputs that are expected, by belief
-propagation: the joint posterior of state and coefficients is updated along the imagined trajectory, so what one sample
-teaches is not counted again by the next. The teaching part then telescopes: a plan of the whole episode would be
-Bayesian D-optimal. J is the information that the rest of the episode after H will bring anyway, at the rate of the last
-plans; so a plan looks for what will be lacking at the end. Plans that do not reach the end of the episode are compared
-by a mean of G after each of their moves, in which what a move adds counts the less the later it is
-(`agents.planning.receding_horizon`). Where the coefficients walk (``drift``) J is 0, and the walk is imagined too.
+with C_0 the covariance of the coefficients now and C_H their covariance after the H expected outputs, by belief
+propagation: the joint posterior of state and coefficients is updated along the trajectory, so that the information of a
+sample counts once. The information gain then telescopes: a plan of the whole episode would be Bayesian D-optimal. J is
+the information that the rest of the episode brings anyway, at the rate of the last plans; so a plan seeks the
+information that would be missing at the end. Plans that do not reach the end of the episode are compared by a mean of G
+after each of their moves, with a discount (`agents.planning.discount`). Where the coefficients walk (``drift``) J is 0,
+and the walk is rolled out as well.
 
-What the first sensor shows should stay within the limit by a margin of standard deviations of the output that is then
-predicted; plans that do not are the worse the further they go within it, as fast as the chance of an early end grows,
-and beyond the limit they are worth nothing. On a rig the margin is as firm as the limit. The margin is the quantile
-that Student's t exceeds with probability ``risk`` in a whole episode of outputs that all are at the margin
-(`agents.planning.plan_objective.margin_profile`); it narrows as the noises become known. Few are at it, so much less comes true.
-The standard deviation is what is expected two samples before: near its limit a plan may brake as hard as it can
-already, and cannot make up for what one more output tells. Where it could brake harder, most of what that would move
-the output is taken off the margin, down to the deviations that are expected one sample before (not on a rig). Where an
-input comes to act in full only a sample later, because it goes linearly from the last one to the new, the noise of the
-sample between moves the next output about as much again, and no input makes up for it: the margin is then twice as
-wide.
+The first sensor's output keeps a margin from the limit, in predictive standard deviations. The cost of an output within
+the margin grows as the probability of an early end does, and beyond the limit it exceeds all information. On a rig the
+margin is as hard as the limit. The margin is the quantile that Student's t exceeds with probability ``risk`` in an
+episode whose outputs are all at the margin (`agents.planning.plan_objective.margin_profile`); it narrows as the noises
+become known. Few outputs are at the margin, so violations are much rarer. The standard deviation is predicted two
+samples before: near its limit a plan may brake as hard as it can already, and cannot react to one more output. Where
+it could brake harder, most of the output's change by that is taken off the margin, down to the deviations predicted one
+sample before (not on a rig). Where an input acts in full only a sample later, because it goes linearly from the last
+one to the new, the noise of the sample between moves the next output about as much again, and no input corrects it: the
+margin is then twice as wide.
 
-Between two samples a rig goes further than what is seen of it, and a plan that hides a peak there meets it later, when
-nothing helps: on a rig the limit is lower by what a swing at it can hide.
+Between two samples a rig's output exceeds the samples, and a plan with a hidden peak meets it later, when nothing
+helps: on a rig the limit is lower by the part of a peak that samples can miss.
 
-The search (`agents.planning.receding_horizon`) builds a plan move by move, by the best ways through the plane of the
-model's first two states, and improves it, the last plan and the next best one then, by steps of the whole plan and by
-small changes. Horizon 1 is myopic.
+The search (`agents.planning.receding_horizon`) is a beam search on a grid of the model's first two states, refined by
+Newton steps and mutations. Horizon 1 is myopic.
 
-Where the input's energy is limited (``max_rms`` of the environment), the plan is for the whole rest of the episode, and
-climbs by gradient (`agents.planning.energy_limited_plan`): then the question is when to spend, which no short horizon can answer.
-That search knows neither ``max_slew`` nor ``drift``.
+Where the input's energy is limited (``max_rms`` of the environment), the plan covers the whole rest of the episode, by
+gradient (`agents.planning.energy_limited_plan`): timing then matters, which no short horizon sees. That search takes
+neither ``max_slew`` nor ``drift`` into account.
 """
 
 from __future__ import annotations
@@ -59,16 +58,16 @@ from estimator.support.array_types import FloatArray
 
 
 class EfePlannerState(NamedTuple):
-    """What `EfePlanner.predict` goes on from, of n environments.
+    """The state of `EfePlanner.predict` for n environments.
 
     Attributes:
         plans: (n, horizon) the last plans [V].
         runner_ups: (n, horizon) the next best ones [V].
-        information_rates: (n, K, K) what plans taught per sample.
+        information_rates: (n, K, K) information of plans per sample.
         rng_states: (n, 4) the streams of random numbers.
         last_inputs: (n,) the last inputs [V].
-        chosen_inputs: (n,) the inputs that were chosen last [V].
-        remaining_holds: (n,) samples that these are still to be held for.
+        chosen_inputs: (n,) the inputs chosen last [V].
+        remaining_holds: (n,) samples for which these are still held.
         holds: (n,) samples of a move of the plans.
     """
 
@@ -82,48 +81,55 @@ class EfePlannerState(NamedTuple):
     holds: npt.NDArray[np.int64]
 
 
-#: Moves to plan under an amplitude limit: some periods of the oscillator.
+#: Moves of a plan under an amplitude limit: some periods of the oscillator.
 _DEFAULT_HORIZON = 44
 
-#: Rounds of a decision, at most: three are usual.
+#: Rounds of refinement of a plan, at most; three are usual.
 _DEFAULT_ROUNDS = 12
 
-#: Moves that a short episode is divided into: none is longer than these need to reach its end.
+#: Moves of an episode, at least: in a short episode moves are shorter.
 _MIN_EPISODE_MOVES = 24
 
 #: Moves of a plan, at most.
 _MAX_MOVES = 100_000
 
-#: Cells of the map, times the third root of the moves that a swing takes to come near the limit, and their bounds: the
-#: less a move does beside the limit, the finer the map.
-_CELLS_PER_CUBE_ROOT, _MIN_CELLS, _MAX_CELLS = 13.5, 22, 38
+#: Cells of the grid along an axis, per cube root of the moves in which the output rises to the limit: the smaller the
+#: effect of a move, the finer the grid.
+_CELLS_PER_CUBE_ROOT = 13.5
+
+#: Cells of the grid along an axis, at least.
+_MIN_CELLS = 22
+
+#: Cells of the grid along an axis, at most.
+_MAX_CELLS = 38
 
 
 class EfePlanner:
-    """Expected free energy planning on an environment's belief and model; it is no function of the observation.
+    """Expected free energy planner on the belief and the model of an environment; no function of the observation.
 
-    So it plays the environment that it was made for, and no other. `predict` must be called between that one's steps,
-    with what it showed last, which is checked; a wrapper that changes or delays observations is refused by that.
+    It plays the environment that it was made for, and no other. `predict` must be called between the steps of that
+    environment, with its last observation, which is checked: a wrapper that changes or delays observations is refused.
 
-    Environment i searches with a stream of random numbers of its own, the i-th child of the seed, so that its inputs
-    do not depend on the size of the batch.
+    Environment i searches with its own stream of random numbers, the i-th child of the seed, so that its inputs do not
+    depend on the size of the batch.
 
     Args:
         env: the unwrapped environment, single or vector, whose beliefs it reads.
         seed: of the search.
-        horizon: moves to plan for, each held for at most ``objective.hold_samples`` samples, but no longer than the episode needs;
-            by default 44, and the whole episode sample by sample where the energy is limited. No more than 24 of the
-            last 48 of an episode.
-        rounds: of steps and changed copies of each plan that climbs, at most, two blocks of `estimator.compilation.simd.LANES`
-            each; one that brings less than 0.00005 nats is the last. Of no effect on a plan of the whole episode.
-        risk: chance that an episode ends early if every output were at the margin and the belief is right, in (0, 1).
-        goal: mean of the goal prior of what the first sensor shows, within its limit.
-        goal_std: its standard deviation; no goal where it is None.
-        input_cost: nats for the square of an input. Like the goal, it is in the belief's scale: in V on the tracks.
+        horizon: moves of a plan, each held for at most ``objective.hold_samples`` samples, but no longer than the
+            episode needs; by default 44, and the whole episode sample by sample where the energy is limited. No more
+            than 24 in the last 48 moves of an episode.
+        rounds: of refinement of each plan, at most, two blocks of `estimator.compilation.simd.LANES` candidates each; a
+            round that gains less than 0.00005 nats is the last. Without effect on a plan of the whole episode.
+        risk: probability that an episode ends early if every output were at the margin and the belief is right, in
+            (0, 1).
+        goal: mean of the goal prior of the first sensor's output, within its limit.
+        goal_std: its standard deviation; None for no goal.
+        input_cost: nats per squared input. Like the goal, it is in the belief's scale: in V on the tracks.
 
     Attributes:
-        view: of the model that is planned on.
-        terms: what plans are judged by.
+        model_view: of the model in plans.
+        objective: of plans, for the whole episode.
 
     Raises:
         ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
@@ -296,15 +302,15 @@ class EfePlanner:
         """The observations (n, features) of all environments, and which of them begin an episode (n,).
 
         Raises:
-            ValueError: for an observation that is not finite, or not what ``env`` showed last; or a state or
-                ``episode_start`` that does not go with it.
+            ValueError: for an observation that is not finite, or not the last one of ``env``; or a state or
+                ``episode_start`` for another batch.
         """
         observed, n = to_float_array("observation", observation), len(self._env.records)
         min_size = observation_layout(self.model_view.model).size
         if observed.ndim not in (1, 2) or observed.shape[-1] < min_size or observed.size != n * observed.shape[-1]:
             raise ValueError(
-                f"observation must be of the planner's own {n} environments, with {min_size} entries each, but has shape "
-                f"{observed.shape}"
+                f"observation must be of the {n} environments of this planner, with {min_size} entries each, but has "
+                f"shape {observed.shape}; pass what they showed last"
             )
         if not np.isfinite(observed).all():
             raise ValueError("observation must be finite, but is not; pass what the environment showed last")

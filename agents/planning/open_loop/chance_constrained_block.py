@@ -1,15 +1,15 @@
-"""Whole blocks of inputs, chosen on a belief before any of their outputs is seen.
+"""Chance-constrained optimisation of a block of inputs, fixed before any of its outputs is observed.
 
-A block is planned for systems that are drawn from the belief, not for its means: it climbs the mean of what they tell,
+A block is optimised for systems sampled from the belief, not for its means. It ascends their expected D-optimality
 
-    J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / aim - 1)²],
+    J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / soft limit - 1)²]
 
-by the gradient (`agents.planning.d_optimality`), each system k with coefficients, state and process noise of its own. Several
-hundred further draws tell whether a block is safe: whether so few of them leave the limit that the probability is below
-a bound, with a confidence of 95 % (`agents.planning.open_loop.posterior_samples`). Until then, some of those that leave join the systems
-that are planned for, and no longer count; and the *aim* falls, each time by more. Once the block is safe, aims
-between the last two are tried. There are many summits. So several candidates climb, among them the planner's own plan
-for the belief's means; the best of what is safe is taken.
+by the gradient (`agents.planning.open_loop.expected_d_optimality`); each system k has its own coefficients, state and
+process noise. Several hundred further draws decide whether a block is safe: whether the probability of leaving the
+limit is below a bound with a confidence of 95 % (`agents.planning.open_loop.posterior_samples`). While it is not, some
+of the draws that leave the limit join the systems that are optimised for, and no longer count; and the *soft limit*
+falls, each time by more. Once the block is safe, soft limits between the last two are tried. J has many local maxima,
+so several guesses ascend, among them the plan for the belief's means; the best safe block is taken.
 """
 
 from __future__ import annotations
@@ -34,41 +34,64 @@ from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
 
-#: Systems that a block is planned for.
+#: Sampled systems that a block is optimised for.
 N_SYSTEMS = 32
 
-#: Steps of the gradient for a candidate, besides one for each sample and up to so many in all; and after every change
-#: of the aim.
-_N_STEPS, _MAX_STEPS, _N_STEPS_AFTER_TIGHTENING = 600, 1024, 200
+#: Gradient steps of the first ascent, besides one per sample.
+_N_STEPS = 600
 
-#: The first step (`agents.planning.projected_gradient`), the part of a step that goes into the next, and the last step in parts of
-#: the first.
-_STEP_FRACTION, _MOMENTUM, _FINAL_STEP_FRACTION = 0.05, 0.8, 0.05
+#: Gradient steps of the first ascent, at most.
+_MAX_STEPS = 1024
 
-#: The aim in parts of the limit, and how often it falls: by this part of it at first, then by more and more, up to the
-#: last number. Each time so many systems that leave the limit are added to those that are planned for.
-_SOFT_LIMIT_FRACTION, _MAX_TIGHTENINGS, _N_SYSTEMS_ADDED = 0.998, 16, 8
-_FIRST_TIGHTENING, _TIGHTENING_GROWTH, _MAX_TIGHTENING = 0.005, 1.5, 0.05
+#: Gradient steps after every change of the soft limit.
+_N_STEPS_AFTER_TIGHTENING = 200
 
-#: Of a candidate's time, about so much is left after it was climbed first, and of that after every change of the aim.
+#: Length of the first step in parts of the radius (`agents.planning.projected_gradient`).
+_STEP_FRACTION = 0.05
+
+#: Part of a step that is added to the next.
+_MOMENTUM = 0.8
+
+#: Length of the last step in parts of the first.
+_FINAL_STEP_FRACTION = 0.05
+
+#: First soft limit in parts of the limit.
+_SOFT_LIMIT_FRACTION = 0.998
+
+#: Falls of the soft limit, at most.
+_MAX_TIGHTENINGS = 16
+
+#: Draws beyond the limit that join the systems at each fall.
+_N_SYSTEMS_ADDED = 8
+
+#: Part of the soft limit by which it falls first.
+_FIRST_TIGHTENING = 0.005
+
+#: Ratio of successive falls.
+_TIGHTENING_GROWTH = 1.5
+
+#: Part of the soft limit by which it falls, at most.
+_MAX_TIGHTENING = 0.05
+
+#: Part of a guess's time that is left after its first ascent, and part of the rest after each later one.
 _REMAINING_TIME_FRACTION = 0.6
 
-#: How often the last fall is halved, once a block is safe: it was too far by half of it on average.
+#: Bisections of the last fall once a block is safe.
 _N_BISECTIONS = 2
 
-#: Draws that a block is planned for, at most.
+#: Draws that a block is optimised for, at most.
 MAX_PLANNED_DRAWS = N_SYSTEMS + _MAX_TIGHTENINGS * _N_SYSTEMS_ADDED
 
-#: Penalty [nats] of what goes beyond the aim: one system of all must not leave it far for what the others tell.
+#: Penalty [nats] beyond the soft limit: the information of other systems must not pay for one that leaves it far.
 _EXCESS_PENALTY = 3e4
 
 
 def sampled_systems(
     view: ModelView, belief: Belief, monte_carlo: MonteCarloSystems, n_samples: int, previous_input: float = 0.0
 ) -> SampledSystems:
-    """The first of drawn systems, before a block of so many samples; ``previous_input`` is the input before it.
+    """The first of the draws, as systems before a block of ``n_samples``; ``previous_input`` is the input before it.
 
-    What is not known of a state is what the belief does not know of it.
+    The covariance of their states is the belief's.
     """
     d_optimality, n = compile_d_optimality(view.model, view.degree), view.model.n_states
     precision = np.asarray(np.linalg.inv(belief.coefficients_cov), dtype=np.float64)
@@ -84,7 +107,7 @@ def sampled_systems(
 
 
 def _extend_systems(systems: SampledSystems, monte_carlo: MonteCarloSystems, added_draws: list[int]) -> SampledSystems:
-    """The systems, and more of the draws."""
+    """The systems with further draws."""
     starts = np.repeat(systems.path_starts[:1], len(added_draws), axis=0)
     starts[:, : monte_carlo.model.n_states] = monte_carlo.states[added_draws]
     return SampledSystems(
@@ -100,7 +123,7 @@ def _extend_systems(systems: SampledSystems, monte_carlo: MonteCarloSystems, add
 
 @cache
 def _compile_momentum_ascent(model: Model, degree: int) -> Any:
-    """``ascend(systems, limits, iterations, u)``: climb from u (T,); the best met overwrites it. Gives its J."""
+    """``ascend(systems, limits, iterations, u)`` overwrites u (T,) by the best input of an ascent; returns its J."""
     workspace_for, criterion_and_gradient = compile_expected_d_optimality(model, degree)
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}")
@@ -118,7 +141,7 @@ def _compile_momentum_ascent(model: Model, degree: int) -> Any:
             squared_norm = 0.0
             for t in range(T):
                 if abs(u[t]) >= limits.amplitude and u[t] * gradient[t] > 0.0:
-                    gradient[t] = 0.0  # the limit holds it where it is
+                    gradient[t] = 0.0  # held by the amplitude limit
                 squared_norm += gradient[t] * gradient[t]
             if i == iterations or not squared_norm > 0.0:
                 break
@@ -136,26 +159,26 @@ def _compile_momentum_ascent(model: Model, degree: int) -> Any:
 
 
 def optimise_block(
-    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, candidates: FloatArray, amplitude: float, max_probability: float,
-    n_safe_samples: int | None = None, tell: ProgressCallback = ignore_progress,
+    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, candidates: FloatArray, amplitude: float,
+    max_probability: float, n_safe_samples: int | None = None, tell: ProgressCallback = ignore_progress,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
-    """The best input that is safe enough: what tells most on average, of the summits that candidates lead to.
+    """The block with the largest expected information among the safe blocks that the candidates lead to.
 
     Args:
         view: of the model.
-        systems: that it is planned for.
-        monte_carlo: that tell how safe it is.
-        candidates: (n, T) to begin from.
+        systems: that it is optimised for.
+        monte_carlo: draws that decide whether it is safe.
+        candidates: (n, T) initial guesses.
         amplitude: limit of the input.
-        max_probability: of the probability.
-        n_safe_samples: samples that are asked to be safe; all where None.
-        tell: is told the share that is done.
+        max_probability: of leaving the limit.
+        n_safe_samples: first samples that must be safe; all where None.
+        tell: called with the fraction that is done.
 
     Returns:
-        Inputs (T,) in the belief's scale; the share of what was planned that they are, as `Futures.share`; and
-        `Futures.probability_bound` of leaving the limit.
+        Inputs (T,) in the belief's scale; their scale relative to the optimised block
+        (`MonteCarloSystems.safe_scale`); and `MonteCarloSystems.probability_bound` of leaving the limit.
     """
-    monte_carlo.disturbances(candidates.shape[1])  # drawn before the threads share them
+    monte_carlo.disturbances(candidates.shape[1])  # drawn before the threads start
     progress, lock = np.zeros(len(candidates)), Lock()
 
     def climb(k: int) -> tuple[FloatArray, float, float]:
@@ -177,13 +200,12 @@ def optimise_block(
 
 
 def _climb_candidate(
-    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, amplitude: float, max_probability: float, n_safe_samples: int | None, u: FloatArray,
-    tell: ProgressCallback,
+    view: ModelView, systems: SampledSystems, monte_carlo: MonteCarloSystems, amplitude: float, max_probability: float,
+    n_safe_samples: int | None, u: FloatArray, tell: ProgressCallback,
 ) -> tuple[FloatArray, float, float]:  # fmt: skip
-    """As `optimise_block`, from one candidate (T,)."""
-    ascend = _compile_momentum_ascent(
-        with_coarse_substeps(view.model), view.degree
-    )  # how safe a block is, is judged with all steps
+    """As `optimise_block`, from one candidate u (T,)."""
+    # The optimisation takes coarse steps; safety is checked with all of them.
+    ascend = _compile_momentum_ascent(with_coarse_substeps(view.model), view.degree)
     planned = set(range(N_SYSTEMS))
 
     def ascended(u: FloatArray, aim: float, iterations: int) -> FloatArray:
@@ -225,12 +247,12 @@ def _climb_candidate(
 def expected_information(
     view: ModelView, systems: SampledSystems, limit: float, u: FloatArray
 ) -> tuple[float, FloatArray]:
-    """What inputs (T,) are expected to tell: the mean of ½ log det(Λ + F) [nats], and (S, K, K) covariances after them.
+    """Expected information of inputs (T,): the mean of ½ log det(Λ + F) [nats], and (S, K, K) covariances after them.
 
     Args:
         view: of the model.
-        systems: that are believed in.
-        limit: of the first sensor's signal; what comes after it was left far does not count.
+        systems: sampled from the belief.
+        limit: of the first sensor's signal; samples after a signal far beyond it do not count.
         u: the inputs.
     """
     d_optimality = compile_d_optimality(view.model, view.degree)

@@ -19,7 +19,7 @@ _NOISE_STD_FRACTION = 0.3
 def initial_guesses(
     settings: PlanSettings, record: FloatArray, n_samples: int, seed: int, n_noise_guesses: int = 2
 ) -> FloatArray:
-    """Inputs (2 + noises, samples) for `agents.planning.open_loop.chance_constrained_block.optimise_block` to start from.
+    """Inputs (2 + noises, samples) from which `chance_constrained_block.optimise_block` starts.
 
     The first guess is the plan for a system at the belief's means. Its margin is the smallest of the episode's, and it
     counts on no output: `optimise_block` keeps the limits.

@@ -1,4 +1,4 @@
-"""Systems drawn from a belief, what they do with inputs, and how probable it is that an output leaves its range."""
+"""Systems sampled from a belief, their simulated outputs, and the probability that an output leaves its limit."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from estimator.models.model import Model
 from estimator.online import OnlineEstimator
 from estimator.support.array_types import FloatArray
 
-#: Systems that are drawn from a belief, at least.
+#: Systems drawn from a belief, at least.
 MIN_DRAWS = 500
 
-#: How certain it is that a probability is no more than what the draws tell of it.
+#: Confidence of upper limits of probabilities.
 _CONFIDENCE = 0.95
 
-#: Draws that are followed at once.
+#: Draws that are simulated at once.
 _BATCH_SIZE = 250
 
-#: An input that is too large is tried again at this share, so often: down to a thousandth.
-_BACKOFF_FACTOR, _MAX_BACKOFFS = 0.8, 31
+#: Factor by which an unsafe input shrinks.
+_BACKOFF_FACTOR = 0.8
 
-#: What noise of unit strength adds to the input at most: a drawn system may have hardly any gain.
+#: Times that it shrinks, at most: down to a thousandth.
+_MAX_BACKOFFS = 31
+
+#: Input that noise of unit strength is equal to, at most: a drawn system may have hardly any gain.
 _MAX_NOISE_INPUT = 1e12
 
 #: States and coefficients (draws, d), and deviations of the process noise and each sensor's (draws, 1 + sensors).
@@ -35,7 +38,7 @@ SystemDraws = tuple[FloatArray, FloatArray]
 
 
 def required_draws(max_probability: float, n_planned: int) -> int:
-    """Systems that can tell a probability below a bound, also where so many of them are planned for."""
+    """Draws that can show a probability below ``max_probability``, besides ``n_planned`` that are optimised for."""
     return max(MIN_DRAWS, math.ceil(-math.log(1.0 - _CONFIDENCE) / max_probability) + n_planned)
 
 
@@ -45,7 +48,7 @@ def draw_from_records(
 ) -> SystemDraws:  # fmt: skip
     """Systems from a mixture of beliefs, records (n, size) as `estimator.Belief` keeps them, with weights (n,).
 
-    Deviations from a belief's means, and of the noises, are ``deviation_scale`` times what is believed.
+    Deviations from a belief's means, and of the noises, are ``deviation_scale`` times the believed ones.
     """
     weights = np.where(np.isfinite(records).all(axis=1), weights, 0.0)
     counts = rng.multinomial(n_draws, weights / weights.sum())
@@ -60,13 +63,13 @@ def draw_from_records(
 
 
 def draw_from_estimator(estimator: OnlineEstimator, rng: np.random.Generator) -> SystemDraws:
-    """Systems from an estimator's posterior, its hypotheses as often as they are probable."""
+    """Systems from an estimator's posterior, a mixture of its noise hypotheses."""
     arrays = estimator.arrays()
     return draw_from_records(estimator.model, arrays["records"], arrays["weights"], rng)
 
 
 def draw_at_rest(belief: Belief, rng: np.random.Generator, n_draws: int = MIN_DRAWS) -> SystemDraws:
-    """Oscillators of Eq. (1) from a belief, each where it rests without input: of two wells, in either."""
+    """Oscillators of Eq. (1) from a belief, each at an equilibrium without input: with two wells, in either."""
     drawn, noises = draw_from_records(belief.model, belief.record[None], np.ones(1), rng, n_draws)
     n = belief.model.n_states
     drawn[:, :n] = 0.0
@@ -76,7 +79,7 @@ def draw_at_rest(belief: Belief, rng: np.random.Generator, n_draws: int = MIN_DR
 
 
 def equilibria(model: Model, coefficients: FloatArray) -> list[float]:
-    """States x at which an oscillator of Eq. (1) rests without input: one, or that of each of two wells.
+    """Stable equilibria x of an oscillator of Eq. (1) without input: one, or one in each of two wells.
 
     The origin, where there is none.
     """
@@ -91,7 +94,7 @@ def equilibria(model: Model, coefficients: FloatArray) -> list[float]:
 
 @cache
 def noise_as_input(model: Model) -> Callable[..., FloatArray]:
-    """What process noise of unit strength adds to the input, held over a sample: a function of (draws,) coefficients.
+    """The input that process noise of unit strength is equal to, held over a sample: a function of (draws,) coefficients.
 
     Raises:
         ValueError: for a model whose noise acts on another state than its input does.
@@ -116,14 +119,14 @@ def noise_as_input(model: Model) -> Callable[..., FloatArray]:
 
 
 class MonteCarloSystems:
-    """What drawn systems do with inputs, in their noises, which stay the same from input to input.
+    """Simulations of sampled systems, with noises that stay the same from input to input.
 
     Args:
         model: of the systems.
         draws: states, coefficients and noises.
         limit: of the output, in the belief's scale.
         rng: of the noises.
-        delay: samples by which inputs act later.
+        delay: of the input, in samples.
         degree: of the input over a sample: 0 held, 1 linear.
 
     Attributes:
@@ -143,7 +146,7 @@ class MonteCarloSystems:
         self._noise_inputs: tuple[FloatArray, FloatArray] | None = None
 
     def disturbances(self, samples: int) -> tuple[FloatArray, FloatArray]:
-        """(draws, samples) what process noise adds to the input, and what the first sensor adds to its output."""
+        """(draws, samples) process noise, as an addition to the input, and noise of the first sensor."""
         if self._noise_inputs is None or self._noise_inputs[0].shape[1] < samples:
             rng = np.random.default_rng(self._seed)
             process, sensor = rng.standard_normal((2, samples, len(self.noises))).swapaxes(1, 2)
@@ -155,12 +158,12 @@ class MonteCarloSystems:
         return process[:, :samples], sensor[:, :samples]
 
     def violating_draws(self, u: FloatArray, max_count: int, planned: Collection[int] = ()) -> list[int]:
-        """The first draws, and at most so many, that inputs (N,), in the belief's scale, take out of the limit.
+        """The first draws whose outputs leave the limit under inputs (N,), in the belief's scale.
 
         Args:
             u: the inputs.
-            max_count: draws that are returned at most.
-            planned: draws that the inputs were planned for, and which therefore do not tell how safe they are.
+            max_count: draws that are returned, at most.
+            planned: draws that the inputs were optimised for, which are no evidence of safety.
         """
         found: list[int] = []
         for first in range(0, len(self.states), _BATCH_SIZE):
@@ -172,7 +175,7 @@ class MonteCarloSystems:
         return found[:max_count]
 
     def simulate_outputs(self, u: FloatArray, draws: slice) -> FloatArray:
-        """(draws, N) what the sensors of some draws show with inputs (N,), in the belief's scale."""
+        """(draws, N) outputs of some draws under inputs (N,), in the belief's scale."""
         acting = np.concatenate([np.zeros(self.delay), u])[: len(u)]
         process, sensor = self.disturbances(len(u))
         disturbed_input, coefficients, states = acting + process[draws], self.coefficients[draws], self.states[draws]
@@ -180,30 +183,30 @@ class MonteCarloSystems:
             return free_run(self.model, coefficients, disturbed_input, states, self.interpolation) + sensor[draws]
 
     def violation_probability(self, u: FloatArray, max_probability: float = 1.0) -> float:
-        """That inputs (N,), in the belief's scale, take the output out of its limit at any of the samples: `probability_bound`.
+        """`probability_bound` that inputs (N,), in the belief's scale, take an output beyond its limit at any sample.
 
-        Draws are counted until it is not below the bound any more.
+        Draws are counted until it reaches ``max_probability``.
         """
         return self.probability_bound(len(self.violating_draws(u, self.min_violations_for(max_probability))))
 
     def probability_bound(self, count: int, n_planned: int = 0) -> float:
-        """The upper 95 % limit of the probability of what so many of the draws do: it is never 0.
+        """Upper 95 % limit of the probability of an event that ``count`` of the draws show; never 0.
 
-        The exact limit (Clopper and Pearson), without so many draws that were planned for.
+        The exact limit of Clopper and Pearson, without the ``n_planned`` draws that were optimised for.
         """
         draws = len(self.states) - n_planned
         return float(betaincinv(count + 1, draws - count, _CONFIDENCE)) if count < draws else 1.0
 
     def min_violations_for(self, max_probability: float, n_planned: int = 0) -> int:
-        """The least number of draws whose `probability_bound` is not below a bound, 1 at least."""
+        """The least number of draws, at least 1, whose `probability_bound` is not below ``max_probability``."""
         draws = len(self.states) - n_planned
         return max(1, next((k for k in range(draws) if self.probability_bound(k, n_planned) >= max_probability), draws))
 
     def safe_scale(self, u: FloatArray, max_probability: float) -> tuple[float, float]:
-        """The largest share of inputs whose `violation_probability` of leaving the limit is below a bound, and that probability.
+        """The largest scale of inputs whose `violation_probability` is below ``max_probability``.
 
         Returns:
-            The share, in (0, 1], or 0 where even no input is too much; and the probability at it.
+            The scale, in (0, 1], or 0 where even zero input is unsafe; and the probability at this scale.
         """
         scale = 1.0
         for _ in range(_MAX_BACKOFFS):
