@@ -1,4 +1,4 @@
-"""Policies by name: whatever chooses the input, with the `predict` of Stable-Baselines3.
+"""Policies by name, with the `predict` of Stable-Baselines3: signals, feedback laws, planners, trained networks.
 
 `make_policy("silverbox-multisine", env)` makes a policy that fits `env`. To add one, write a
 function of the unwrapped environment (or None), the seed and its options, and name it in `POLICIES`.
@@ -26,7 +26,7 @@ from estimator.support.argument_checks import MAX_SEED, check_integer, did_you_m
 
 
 class Policy(Protocol):
-    """What a policy is: Stable-Baselines3's `predict`, on one observation or on a batch."""
+    """A policy: Stable-Baselines3's `predict`, on one observation or on a batch."""
 
     def predict(
         self,
@@ -128,6 +128,6 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
         return policy
     known_names = [*POLICIES, *trained_policies()]
     raise ValueError(
-        f"policy must be one that is known, the path of a trained one, or module:name of your own, but is {short_repr(name)}"
-        f"{did_you_mean(name, known_names)}; known are {', '.join(known_names)}"
+        f"policy must be one that is known, the path of a trained one, or module:name of your own, but is "
+        f"{short_repr(name)}{did_you_mean(name, known_names)}; known are {', '.join(known_names)}"
     )

@@ -75,8 +75,8 @@ class BlockPlannerState(NamedTuple):
 class BlockPlanner:
     """Planner of a block at a time on the belief and the model of an environment; no function of the observation.
 
-    It minimises expected free energy (`agents.planning.open_loop.chance_constrained_block`) in the environment that it
-    was made for, as `EfePlanner`.
+    It minimises expected free energy (`agents.planning.open_loop.chance_constrained_block`), and as `EfePlanner` it
+    plays the environment that it was made for.
 
     Args:
         env: as of `EfePlanner`.

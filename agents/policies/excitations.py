@@ -1,9 +1,9 @@
-"""Excitations by name: classical test signals, drawn by a generator, in volts.
+"""Excitation signals by name: classical test signals such as PRBS, multisines and chirps, in volts.
 
-`EXCITATIONS` makes a `SignalDraw` from an amplitude limit, which can be copied and pickled. Every draw is new: what is not
-random about a signal (its band, its levels) is fixed, and its phase, order or start is drawn. The sampling rate is
-610.35 Hz (δ = 1.6384 ms); an input is held for a sample. `agents.policies.signals.SignalPolicy` plays them, within a
-track's limits. docs/policies.md has a table of them, with their frequency content.
+`EXCITATIONS` makes a `SignalDraw`, which can be copied and pickled, from an amplitude limit. Every draw is new: band
+and levels of a signal are fixed; phase, order or start are random. The sampling rate is 610.35 Hz (δ = 1.6384 ms); an input
+is held for a sample. `agents.policies.signals.SignalPolicy` plays them within a track's limits. docs/policies.md has a
+table of them with their frequency content.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ PRBS_LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 def draw_regime(name: str) -> SignalDraw:
     """A stretch of a regime of the Silverbox record, or of its synthesised stand-in.
 
-    The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One
-    longer than the regime starts at its first sample and repeats it. See `duffing_env.plants.silverbox_record.regime_input`.
+    The stretch is contiguous and starts anywhere it fits, gaps and quiet beginning included. One longer than the regime
+    starts at its first sample and repeats it. See `duffing_env.plants.silverbox_record.regime_input`.
     """
     return partial(_regime, name=name)
 
@@ -85,7 +85,7 @@ def draw_prbs(max_input: float, hold: int = 1) -> SignalDraw:
 
 
 def draw_levels(max_input: float, hold: int, levels: tuple[float, ...] = PRBS_LEVELS) -> SignalDraw:
-    """A random signal of a few levels, in parts of `max_input` volts, with even odds, each held for so many samples.
+    """A random signal of a few levels, in parts of `max_input` volts, with even odds, each held for `hold` samples.
 
     Raises:
         ValueError: `hold` is no whole number of at least 1.

@@ -1,13 +1,13 @@
-"""Classical policies with feedback: they read the believed resonance, or the believed velocity, off the observation.
+"""Feedback policies without learning: they use the believed resonance, or the believed velocity, of the observation.
 
-Velocity and resonance are those of any model (`agents.planning.model_probe`): of Eq. (2) x_t - x_{t-1} and the angle of the
-poles, of Eq. (1) x' and the square root of the stiffness over the mass, but for the damping.
+Velocity and resonance are defined for any model (`agents.planning.model_probe`): for Eq. (2) x_t - x_{t-1} and the
+angle of the poles, for Eq. (1) x' and the square root of stiffness over mass, up to the damping.
 
-Both give ±amplitude: the amplitude limit, or the budget's RMS where that is smaller. Both brake, giving the input
-against the velocity, while the amplitude that the oscillation is believed to have is beyond `BRAKE_FRACTION` of the displacement
-that ends the episode. Where the limits allow for an amplitude so large, they spend the rest of the episode about it,
-pumping and braking by turns, which puts most of the power above the resonance. Both are deterministic: the seed has no
-effect. Where an action is held for several samples, both choose it by what is believed at the first.
+Both policies give ±amplitude: the amplitude limit, or the budget's RMS where it is smaller. Both brake, with an input
+against the velocity, while the believed amplitude of the oscillation exceeds `BRAKE_FRACTION` of the displacement that
+ends the episode. Where the limits allow so large an amplitude, they spend the rest of the episode near it, pumping and
+braking by turns, which puts most of the power above the resonance. Both are deterministic: the seed has no effect.
+Where an action is held for several samples, both choose it by the belief at the first.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ there must be room for more than one. Of 2,048 episodes of each track with a lim
 the largest displacement was 0.78 of the limit on Amplitude-v0, 0.93 on Output-v0 and 0.98 on Drift-v0.
 """
 
-#: Cycles per sample between which a resonance is looked for.
+#: Lower and upper limit of a believed resonance, in cycles per sample.
 _RESONANCE_BAND = (BAND[0] * SILVERBOX_SAMPLING_STEP, BAND[1] * SILVERBOX_SAMPLING_STEP)
 
 #: The signs `(n,)` of inputs that need not brake, of velocities and phases of a wave of the believed resonance.
@@ -43,14 +43,14 @@ SignLaw = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float6
 
 
 class FeedbackPolicy:
-    """What the policies have in common: the limits, the prior that an observation is relative to, and the brake.
+    """Common part of the policies: the limits, the prior that an observation is relative to, and the brake.
 
     Attributes:
-        limits: What the input keeps to.
+        limits: Limits of the input.
     """
 
     def __init__(self, sign_law: SignLaw, limits: InputLimits, experiment: Experiment) -> None:
-        """Takes from the experiment what an observed mean, in the prior's standard deviations, stands for."""
+        """Takes the scale of observed means, in standard deviations of the prior, from the experiment."""
         self._sign_law, self.limits = sign_law, limits
         self._model, self._step = experiment.model, experiment.step
         self._layout = observation_layout(experiment.model)
@@ -69,7 +69,7 @@ class FeedbackPolicy:
     def _read_motion(
         self, rows: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """What the sensor shows and its velocity, in parts of the limit, and the resonance in cycles per sample."""
+        """The sensor's output and its velocity, in parts of the limit, and the resonance in cycles per sample."""
         layout, k, n = self._layout, self._model.n_coefficients, self._model.n_states
         means = self._centers + self._stds * rows[:, layout.mean : layout.mean + k]
         states = self._limit * rows[:, layout.state : layout.state + n]
@@ -82,8 +82,8 @@ class FeedbackPolicy:
     ) -> NDArray[np.float64]:
         """The amplitude of a free oscillation at the believed resonance, φ rad per sample.
 
-        Of a differential equation A² = x² + (x' / φ)². Two samples of a difference equation tell it wherever in the
-        swing they were taken: A² = (x_t² + x_{t-1}² - 2 x_t x_{t-1} cos φ) / sin² φ. A hardening oscillator swings
+        For a differential equation A² = x² + (x' / φ)². Two samples of a difference equation determine it anywhere in
+        the oscillation: A² = (x_t² + x_{t-1}² - 2 x_t x_{t-1} cos φ) / sin² φ. A hardening oscillator swings
         faster than that near the middle, so there A is taken for larger than it is.
         """
         angles = 2.0 * np.pi * cycles

@@ -1,4 +1,4 @@
-"""`shield`: pushes along the velocity, bounded by the networks' shield. Nothing is learned."""
+"""Baseline ``shield``: pushes along the velocity, within the networks' shield, without learning."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _VELOCITY = FEATURE_NAMES.index("velocity")
 
 
 class ShieldBaseline:
-    """Push along the velocity of the first sensor, as hard as the shield allows (`agents.policies.networks.rollout_features`).
+    """Push along the velocity of the first sensor, as hard as the shield allows.
 
-    A trained network is compared with it: both have the same shield.
+    It has the shield of trained networks (`agents.policies.networks.rollout_features`), and is their baseline.
 
     Args:
-        env: the unwrapped environment, single or vector, whose prior, limits and noises it is to know.
+        env: the unwrapped environment, single or vector, whose prior, limits and noises the shield takes.
         seed: without effect: nothing in it is random.
 
     Raises:

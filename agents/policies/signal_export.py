@@ -1,4 +1,4 @@
-"""Excitations as CSV, for a real signal generator: ``duffing-env export``."""
+"""Export of excitation signals as CSV, for a signal generator: ``duffing-env export``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def draw_signal(
         name: A name in `agents.policies.excitations.EXCITATIONS`.
         samples: Its length, 1 to `MAX_SAMPLES`; multisines need 5.
         max_input: The amplitude limit, in volts, positive.
-        max_rms: The largest root mean square, in volts, positive; None: no limit. See `Limits.fit`.
+        max_rms: The largest root mean square, in volts, positive; None: no limit. See `InputLimits.to_actions`.
         seed: The seed of the draw, 0 or more.
 
     Returns:
@@ -46,7 +46,7 @@ def draw_signal(
     if not isinstance(name, str) or name not in EXCITATIONS:
         remedy = did_you_mean(name, EXCITATIONS)
         if str(name) in FEEDBACK:
-            remedy = "; it answers to what an oscillator does, so it must be played: use agents.make_policy"
+            remedy = "; it is feedback on an oscillator, so it must be played: use agents.make_policy"
         raise ValueError(f"name must be one of {', '.join(EXCITATIONS)}, but it is {short_repr(name)}{remedy}")
     check_integer("samples", samples, MAX_SAMPLES)
     check_integer("seed", seed, MAX_SEED, 0)

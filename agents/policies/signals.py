@@ -1,7 +1,7 @@
-"""Signals as policies: they choose the input without looking at the observation.
+"""Open-loop policies: they play excitation signals, and do not use the observation.
 
-`SignalPolicy` plays a `Draw` of `agents.policies.excitations` through Stable-Baselines3's `predict`, one signal for
-each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the length
+`SignalPolicy` plays a `SignalDraw` of `agents.policies.excitations` through Stable-Baselines3's `predict`, one signal
+for each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the length
 of its episodes, and to its input budget where it has one. `agents.policies.make_policy` calls it by name.
 """
 
@@ -26,23 +26,28 @@ from estimator.support.argument_checks import (
     to_float_array,
 )
 
-# Actions already played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
+#: Number of actions played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
-DEFAULT_MAX_INPUT = 0.15  # V; the largest input of the Silverbox record is 0.149 V
-_SILVERBOX_RESONANCE = (
-    68.1 * SILVERBOX_SAMPLING_STEP
-)  # cycles per sample; the Silverbox's, for which bands and holds are made
-_MAX_DRAW_SAMPLES = 2**16  # of an environment's; longer episodes are continued by the next draw
-DEFAULT_SAMPLES = 1024  # for environments whose episodes have no fixed length
+#: Amplitude limit without an environment [V]; the largest input of the Silverbox record is 0.149 V.
+DEFAULT_MAX_INPUT = 0.15
 
-# Float32 rounding of the actions must not bring a signal of exactly the budget above it.
+#: Resonance of the Silverbox in cycles per sample, to which bands and holds of the signals are fitted.
+_SILVERBOX_RESONANCE = 68.1 * SILVERBOX_SAMPLING_STEP
+
+#: Samples of a draw for an environment, at most; the next draw continues it in longer episodes.
+_MAX_DRAW_SAMPLES = 2**16
+
+#: Samples of a draw for an environment whose episodes have no fixed length.
+DEFAULT_SAMPLES = 1024
+
+#: Part of the budget that signals use: float32 rounding of the actions must not exceed it.
 _RMS_SAFETY_FACTOR = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
 class InputLimits:
-    """What an input must keep to.
+    """Limits of an input.
 
     Attributes:
         max_input: The input at action 1, in volts, positive.
@@ -61,7 +66,8 @@ class InputLimits:
         for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
             if value is not None and not (is_finite_number(value) and MIN_MAGNITUDE <= value <= 1e300):
                 raise ValueError(
-                    f"{name} must be positive and finite, in volts, from {MIN_MAGNITUDE} to 1e300, but it is {short_repr(value)}"
+                    f"{name} must be positive and finite, in volts, from {MIN_MAGNITUDE} to 1e300, but it is "
+                    f"{short_repr(value)}"
                 )
         check_integer("hold", self.hold, 10**9)
 
@@ -100,7 +106,7 @@ class SignalPolicy:
 
     Attributes:
         name: The name of the excitation.
-        limits: What every signal is fitted to.
+        limits: Limits of every signal.
         samples: The length of one draw. A signal that runs out before its episode ends is continued by the next draw.
         actions: The number of actions that play it: fewer, where an action is held for several samples.
         seed: The seed that `reset` starts from.

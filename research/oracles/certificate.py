@@ -1,4 +1,4 @@
-"""Certificates: what no admissible input to Eq. (2) can exceed, stored beside each oracle.
+"""Upper bounds of the information of admissible inputs to Eq. (2), stored beside each oracle.
 
     python -m research.oracles.certificate --env duffing_env/Amplitude-v0 --systems 24
 
@@ -11,10 +11,10 @@ with equality for one V. Let v_t = Wᵀ f(x_t, x_{t-1}, x_{t-2}), with odd monom
 
     log det M ≤ tr(G M) - log det G - 4,
 
-so that the worth of every input is at most ½ [tr(G Λ0) - log det G - 4 + the most that Σ |φ_t - (A V)_t|²_G / q +
-|v_t|²_G / r comes to]. Each term depends on five displacements in a row, and so the most is found by a dynamic
+so that the criterion of every input is at most ½ [tr(G Λ0) - log det G - 4 + the maximum of Σ |φ_t - (A V)_t|²_G / q +
+|v_t|²_G / r]. Each term depends on five displacements in a row, and so the most is found by a dynamic
 programme (`research.oracles.state_grid`). Under a limit of energy, the energy that is left is one more state: a price
-of energy instead would bound mixtures of inputs too, of which those of rest and much energy are worth much more.
+of energy instead would bound mixtures of inputs too, of which those of rest and much energy have much more information.
 
 **G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
 fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. The bound
@@ -26,8 +26,8 @@ only near the best. So it climbs by gradient; and what it, or the mixture, then 
 grid is smaller.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on a finer
-one (`StateGrid.refined`), plus what they differ by. This allowance is no proof, and where energy is limited it is a weak
-one: there the bound does not settle as intervals become more, and a finer grid can lie higher or lower.
+one (`StateGrid.refined`), plus their difference. This allowance is no proof, and it is weak where energy is limited:
+there the bound does not settle as intervals become more, and a finer grid can lie higher or lower.
 """
 
 from __future__ import annotations
@@ -50,21 +50,41 @@ from research.oracles.state_grid import StateGrid
 #: Degrees of the monomials.
 _MONOMIAL_DEGREES = (1, 3, 5)
 
-#: Nodes along an axis of the displacements, and levels of the input.
-_N_NODES, _N_LEVELS = 33, 5
+#: Nodes along an axis of the displacements.
+_N_NODES = 33
 
-#: Where energy is limited: nodes of what is left of it, levels of an action, and how many times more a path has.
-_N_ENERGIES, _N_INPUTS, _PATH_REFINEMENT = 65, 17, 8
+#: Levels of the input in a node.
+_N_LEVELS = 5
 
-#: How a path climbs there: steps at most, the length of the first one in parts of the root of the energy, and by how
-#: much of the largest input each input is moved to see what it brings.
-_N_GRADIENT_STEPS, _FIRST_STEP, _DIFFERENCE_FRACTION = 30, 0.02, 1e-4
+#: Nodes of the energy left, where it is limited.
+_N_ENERGIES = 65
 
-#: Programmes end there where so many have brought bound and mixture less [nats] nearer to each other.
-_PATIENCE, _MIN_PROGRESS = 3, 2e-3
+#: Levels of an action, where energy is limited.
+_N_INPUTS = 17
 
-#: Programmes, and the distance between bound and mixture [nats] at which they end.
-_MAX_PROGRAMMES, _MAX_GAP = 16, 0.01
+#: Ratio of the levels of an action in a path to those in the programme, where energy is limited.
+_PATH_REFINEMENT = 8
+
+#: Gradient steps of a path, at most, where energy is limited.
+_N_GRADIENT_STEPS = 30
+
+#: Length of the first of these steps, in parts of the root of the energy.
+_FIRST_STEP = 0.02
+
+#: Perturbation of an input for finite differences, in parts of the largest.
+_DIFFERENCE_FRACTION = 1e-4
+
+#: Programmes over which progress is measured, where energy is limited.
+_PATIENCE = 3
+
+#: Progress [nats] over these programmes below which they end.
+_MIN_PROGRESS = 2e-3
+
+#: Programmes, at most.
+_MAX_PROGRAMMES = 16
+
+#: Distance between bound and mixture [nats] at which programmes end.
+_MAX_GAP = 0.01
 
 
 class Certificate:

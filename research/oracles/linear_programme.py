@@ -1,4 +1,4 @@
-"""The linear programme of a step of `research.oracles.slp_refinement`: the best small change of an input, within exact limits.
+"""Linear programme of a step of `research.oracles.slp_refinement`: the best small change of an input within its limits.
 
 HiGHS solves it once for every step. From one step to the next its numbers change and its shape does not, so each
 solution starts from the basis of the last, and takes far fewer pivots than from nothing.
@@ -37,7 +37,7 @@ class LinearProgramme:
         samples: T.
         n: states.
         output_state: the state that the first sensor shows, or n where it shows another output.
-        limits: to be kept; ``aim`` is the limit of the signal.
+        limits: to be kept; ``soft_limit`` is the limit of the signal.
 
     Raises:
         ModuleNotFoundError: as `import_highspy`.

@@ -1,18 +1,18 @@
-"""The search for D-optimal inputs at the true parameters, which are stored.
+"""Search of D-optimal inputs at the true parameters, for the oracles stored in the package.
 
     python -m research.oracles.oracle_search --env duffing_env/Amplitude-v0 --systems 64
 
-takes many ways through the map of each system's states (`agents.planning.receding_horizon`), polishes each to a summit of
-½ log det(Λ0 + F(u)) under the track's limits (`research.oracles.slp_refinement`), and keeps what is better than what is stored. F
-is the Fisher information at the true coefficients along the response without noise, Λ0 the inverse of the prior's
-covariance of the coefficients. What is stored is a start. A search ends after so many starts, but goes on, to eight
-times as many, until three that began anew have come to the highest summit.
+makes many starts by beam search on a grid of each system's states (`agents.planning.grid_beam_search`), refines each to
+a local maximum of ½ log det(Λ0 + F(u)) under the track's limits (`research.oracles.slp_refinement`), and stores what is
+better than the stored input. F is the Fisher information at the true coefficients along the response without noise, Λ0
+the inverse of the prior's covariance of the coefficients. The stored input is one of the starts. A search continues, up
+to eight times its starts, until three fresh ones have reached the highest maximum.
 
-With `--check` nothing is stored: a search from fresh starts, twice as long, says for each system what it gains over
-what is stored, and by how much its best three starts differ.
+With `--check` nothing is stored: a search from fresh starts, twice as long, reports for each system its gain over the
+stored input, and the difference between its best three starts.
 
-System i is row i of a batch that is reset with seed 0 in the branch ``test``, as `agents.evaluation.policy_evaluation.evaluate_policies`
-does it by default; it does not depend on the number of systems.
+System i is row i of a batch that is reset with seed 0 in the branch ``test``, as
+`agents.evaluation.policy_evaluation.evaluate_policies` does by default; it does not depend on the number of systems.
 """
 
 from __future__ import annotations
@@ -39,17 +39,29 @@ from research.oracles.beam_start import compile_beam_start
 from research.oracles.linear_programme import import_highspy
 from research.oracles.slp_refinement import refine_input
 
-#: Starts of a search at least; it goes on to so many times as many, until so many that began anew agree within [nats].
-_MIN_STARTS, _MAX_START_FACTOR, _N_AGREEING, _AGREEMENT = 24, 8, 3, 0.002
+#: Starts of a search, at least.
+_MIN_STARTS = 24
 
-#: Cells of the map along each axis, and the spread of the factors by which starts change the rate of information that
-#: they expect: one of each is drawn for every start.
-_CELL_COUNTS, _RATE_SPREADS = (24, 32, 48, 64, 96), (0.1, 0.3, 0.8)
+#: Ratio of its starts, at most, to the starts at least.
+_MAX_START_FACTOR = 8
+
+#: Fresh starts that must agree for a search to end.
+_N_AGREEING = 3
+
+#: Difference [nats] within which they agree.
+_AGREEMENT = 0.002
+
+#: Cells of the grid along each axis, of which one is drawn for every start.
+_CELL_COUNTS = (24, 32, 48, 64, 96)
+
+#: Standard deviations of the logarithms of factors on the expected information rate, one of which is drawn for every
+#: start.
+_RATE_SPREADS = (0.1, 0.3, 0.8)
 
 #: Systems and starts of a command at most.
 _MAX_COUNT = 100_000
 
-#: Share of the limits of signal and energy that is aimed at, because what is stored is rounded.
+#: Part of the limits of signal and energy that searches use, as stored inputs are rounded.
 _LIMIT_FRACTION = 1.0 - 1e-4
 
 
@@ -108,10 +120,10 @@ def search_best_input(
 
 
 def _beam_search_start(
-    one: TrackSystems, limits: DesignLimits, state_scales: FloatArray, best: FloatArray, keeps_beginning: bool, rng: np.random.Generator,
-    rng_state: np.ndarray,
+    one: TrackSystems, limits: DesignLimits, state_scales: FloatArray, best: FloatArray, keeps_beginning: bool,
+    rng: np.random.Generator, rng_state: np.ndarray,
 ) -> FloatArray:  # fmt: skip
-    """The best way through the map of the states; ``keeps_beginning`` says that it begins as the best input so far."""
+    """The plan of a beam search; with ``keeps_beginning`` it begins as the best input so far."""
     model = one.plant.model
     n, size = model.n_states, len(model.names)
     mean, cov = np.zeros(size), np.zeros((size, size))

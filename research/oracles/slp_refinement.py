@@ -1,14 +1,14 @@
-"""Polishing an input at known parameters to a summit of its worth under the exact limits, for any model.
+"""Sequential linear programming: refinement of an input to a local maximum of its D-optimality under exact limits.
 
-Sequential linear programmes: the worth ½ log det(Λ + F(u)) is linearised by its gradient, the motion by the slopes of
+The criterion ½ log det(Λ + F(u)) is linearised by its gradient, the motion by the slopes of
 every sample, and HiGHS finds the best change of at most ``radius`` within the limits of input, signal and energy:
 
     max gᵀδ    with    ξ_{t+1} = A_t ξ_t + B_t δ_t,    |x_t + C_t ξ_t + D_t δ_t| ≤ limit,    |u_t + δ_t| ≤ amplitude,
                        |δ_t| ≤ radius,    2 uᵀδ ≤ energy - uᵀu.
 
-What is left of the change's curvature would add up over the samples, and keep the steps small. So the input that is
-tried follows the planned states by feedback (the gains of a linear quadratic regulator), which keeps the errors of one
-sample from the next: tens of programmes of some milliseconds then reach a summit, where without it hundreds do not.
+The curvature that is left out would add up over the samples, and keep the steps small. So the input follows the planned
+states by feedback (the gains of a linear quadratic regulator), which stops the propagation of errors: tens of
+programmes of some milliseconds then reach a maximum, and hundreds do not without it.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Linearisation(NamedTuple):
         gradient: (T,) of the worth by the inputs.
         output_signal: (T,) what the first sensor shows.
         states: (T, n) before every sample.
-        jacobians: (T, n + 1, n + 3) of the states after a sample, and of what is shown then, by the states before it, its
-            input, the last and the one before.
+        jacobians: (T, n + 1, n + 3) of the states after a sample, and of the output then, by the states before it, its
+            input, the last one and the one before.
     """
 
     gradient: FloatArray
@@ -68,9 +68,11 @@ class Linearisation(NamedTuple):
 def _compile_linearisation(model: Model, degree: int) -> tuple[Any, Any]:
     """``linearise`` and ``track_states``.
 
-    - ``linearise(nominal, limit, u, found)`` fills in a `Linearisation` from rest; gives the worth [nats] and the peak of the signal.
-    - ``track_states(nominal, amplitude, unit, aims, states, jacobians, weights, u)``: the inputs u (T,), multiples of ``unit``,
-      that keep to states (T, n), which the inputs aims (T,) are to bring about; weights (n,) of the states' errors.
+    - ``linearise(nominal, limit, u, found)`` fills in a `Linearisation` from rest, and returns the criterion [nats] and
+      the peak of the signal.
+    - ``track_states(nominal, amplitude, unit, nominal_inputs, states, jacobians, weights, u)`` fills in the inputs u
+      (T,), multiples of ``unit``, that track states (T, n) planned for ``nominal_inputs`` (T,), with weights (n,) of
+      the states' errors.
     """
     found = compile_d_optimality(model, degree)
     code, workspace_for, criterion_and_gradient, earlier = (
@@ -169,17 +171,17 @@ def refine_input(
         model: the equation.
         degree: of the input's polynomial over a sample.
         nominal: what the worth is taken at.
-        limits: to be kept; ``aim`` is the limit of the signal that is aimed at. The energy may be exceeded a little.
+        limits: to be kept; ``soft_limit`` is the limit of the signal in programmes. The energy may be exceeded a little.
         state_scales: (n,) of the states (`agents.planning.time_scales.TimeScales`).
         u: (T,) inputs, which may be beyond the limits of signal and energy.
         quantum: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a
             hard oscillator errors grow by several powers of ten over an episode.
         max_programmes: linear programmes at most.
-        target_value: worth [nats] that is looked for. Where it is out of reach at the pace of the last programmes, an input is
-            given up as it is.
+        target_value: criterion [nats] to reach. An input is given up where this is out of reach at the pace of the last
+            programmes.
 
     Returns:
-        The input and its worth [nats]; -inf where it does not keep the limits.
+        The input and its criterion [nats]; -inf where it does not keep the limits.
     """
     linearise, track_states = _compile_linearisation(model, degree)
     current, candidate = Linearisation.empty(len(u), model.n_states), Linearisation.empty(len(u), model.n_states)

@@ -2,9 +2,9 @@
 
 As `nonlinear_benchmarks` defines it: a model is identified on the first 75 % of the multisine section. From the inputs
 and the first 50 outputs of three test signals (the rest of the multisine; the arrow; the arrow without the part whose
-amplitude exceeds the training's) it simulates the other outputs, and the root mean square of the errors counts. Nothing
-may be decided on test data: `research.studies.silverbox_results.compare_on_validation` compares settings on the last quarter of the
-training section.
+amplitude exceeds the training's) it simulates the other outputs, and the root mean square of the errors counts. No
+setting may be chosen on test data: `research.studies.silverbox_results.compare_on_validation` compares settings on the
+last quarter of the training section.
 
 ``docs/silverbox.md`` discusses the outcome.
 """

@@ -1,10 +1,11 @@
-"""What policies are worth on unseen oscillators of the family, beside the planner.
+"""Comparison of policies with the planner on unseen oscillators of the family.
 
     python -m research.studies.unseen_oscillators --policies ppo/universal shield prbs prbs-4 uniform silverbox-multisine
 
-plays every policy on the same oscillators, one of each rig that is drawn (`agents.training.environments.oscillator_family`), in the branch
-``test`` of the seeds. D-efficiency is exp(2 (I - I_efe) / K), with I the information gained about the K coefficients
-and I_efe that of the planner on the same oscillator with the same noise.
+plays every policy on the same oscillators, one of each rig drawn by
+`agents.training.environments.oscillator_family`, in the branch ``test`` of the seeds. D-efficiency is
+exp(2 (I - I_efe) / K), with I the information gained about the K coefficients and I_efe the planner's on the same
+oscillator with the same noise.
 """
 
 from __future__ import annotations

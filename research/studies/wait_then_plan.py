@@ -1,9 +1,10 @@
-"""What waiting alone is worth where the mass jumps: a script that learns nothing, beside `ppo/drift`.
+"""Baseline of `ppo/drift`, without learning: wait until the mass has jumped, then play the planner.
 
-    python evaluate.py --env Drift-v0 --systems 128 --policies research.studies.wait_then_plan:WaitThenPlan ppo/drift efe
+    python evaluate.py --env Drift-v0 --systems 128 \\
+        --policies research.studies.wait_then_plan:WaitThenPlan ppo/drift efe
 
-The mass of Drift-v0 jumps at a sample that is drawn, and by sample 390 it has. The script pushes one way until then, so
-that the oscillator rests, and leaves the samples after it to the planner.
+The mass of Drift-v0 jumps at a random sample, and before sample 390. The policy pushes one way until then, so that the
+oscillator rests, and plays the planner afterwards.
 """
 
 from __future__ import annotations

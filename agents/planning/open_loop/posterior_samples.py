@@ -94,7 +94,7 @@ def equilibria(model: Model, coefficients: FloatArray) -> list[float]:
 
 @cache
 def noise_as_input(model: Model) -> Callable[..., FloatArray]:
-    """The input that process noise of unit strength is equal to, held over a sample: a function of (draws,) coefficients.
+    """Process noise of unit strength as an input held over a sample: a function of (draws,) coefficients.
 
     Raises:
         ValueError: for a model whose noise acts on another state than its input does.

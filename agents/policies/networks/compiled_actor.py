@@ -1,7 +1,7 @@
-"""The decision of a policy with features, as one compiled function: features, network, shield.
+"""Decision of a trained policy with features as one compiled function: features, network, shield.
 
-Each row is calculated by itself, number by number in the same order. So a decision is the same to the bit alone, in a
-batch, and in a batch of another size.
+Each row is calculated by itself, in the same order of operations. So a decision has the same bits alone, in a batch,
+and in a batch of another size.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from estimator.compilation.simd import jit, kernel
 
 Array = npt.NDArray[Any]
 
-#: What stands between two layers, by its number.
+#: Activations between layers, by their numbers.
 ACTIVATION_NAMES = ("tanh", "relu", "elu")
 
 
 class CompiledActor(NamedTuple):
-    """A network as the compiled function takes it.
+    """A network as arrays, for the compiled decision.
 
     Attributes:
         mean: (features,) float32 of the features.
         scale: (features,) float32 one over their standard deviations.
-        clip: standard deviations that are seen at most.
-        sizes: (layers + 1,) numbers before and behind every layer.
+        clip: largest normalised feature, in standard deviations.
+        sizes: (layers + 1,) widths before and after every layer.
         weights: float32 of all layers, flat: the weights from a number to all of the next layer lie together.
         biases: float32 of all layers, flat.
         activation: of `ACTIVATION_NAMES`.
@@ -58,7 +58,7 @@ class CompiledActor(NamedTuple):
         levels: int,
         squashed: bool,
     ) -> CompiledActor:
-        """That of layers, each a weight (out, in) and a bias (out,)."""
+        """The arrays of layers, each a weight (out, in) and a bias (out,)."""
         mean, std, clip = normalizer
         weights = np.concatenate([np.ravel(weight.T) for weight, _ in layers])
         biases = np.concatenate([bias for _, bias in layers])
@@ -69,9 +69,9 @@ class CompiledActor(NamedTuple):
 
 @jit
 def _accumulate_eight(y, x, weights, n):
-    """Eight numbers, each times the weights from it to ``n`` others, are added to these, one after the other.
+    """Add eight inputs, each times its weights to ``n`` outputs, to the outputs, one after the other.
 
-    So the others are loaded and stored once for eight numbers; processors multiply faster than they store.
+    The outputs are loaded and stored once for eight inputs: processors multiply faster than they store.
     """
     x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
     w0, w1, w2, w3 = weights[:n], weights[n : 2 * n], weights[2 * n : 3 * n], weights[3 * n : 4 * n]
@@ -89,7 +89,7 @@ def _accumulate_one(y, x, weights):
 
 @jit
 def _dense_layer(y, x, weights):
-    """``weights`` (inputs * outputs) times ``x`` (inputs,) are added to ``y`` (outputs,)."""
+    """Add ``weights`` (inputs * outputs) times ``x`` (inputs,) to ``y`` (outputs,)."""
     n, whole = len(y), len(x) - len(x) % 8
     for i in range(0, whole, 8):
         _accumulate_eight(y, x[i:], weights[i * n :], n)
@@ -110,7 +110,7 @@ def _activate(x, start, count, activation):
 
 @jit
 def _forward(actor, values, x):
-    """What the network chooses, in [-1, 1], upright; ``x`` holds every layer's numbers, one after the other."""
+    """The network's action in [-1, 1], before mirroring; ``x`` holds the activations of all layers in turn."""
     sizes, clip = actor.sizes, np.float32(actor.clip)
     for i in range(sizes[0]):
         x[i] = max(-clip, min((values[i] - actor.mean[i]) * actor.scale[i], clip))
@@ -137,9 +137,9 @@ def _forward(actor, values, x):
 
 @cache
 def compile_decision(view: ModelView) -> Any:
-    """``decide(observations, setting, own, actor, actions)``: fills in the actions (n, 1) of observations.
+    """``decide(observations, setting, with_observation, actor, actions)`` fills in the actions (n, 1) of observations.
 
-    Gives the number of the first row that is not finite, whose action it does not fill in; else -1.
+    It returns the index of the first row that is not finite, and stops there; else -1.
     """
     workspace, encode = compile_features(view)
 
@@ -151,7 +151,7 @@ def compile_decision(view: ModelView) -> Any:
             total = np.float32(0.0)
             for j in range(observations.shape[1]):
                 total += np.float32(0.0) * observations[i, j]
-            if total != 0.0:  # NaN, which a number that is not finite makes of 0
+            if total != 0.0:  # NaN, that is 0 times a number that is not finite
                 return i
             sign, action_scale, _ = encode(
                 observations[i], setting, with_observation, buffers, values, allowed_interval

@@ -35,29 +35,29 @@ _MAY_BE_ZERO = ("information_rate", "process_variance", "sensor_variance", "accu
 
 
 class FeatureSettings(NamedTuple):
-    """What observations are relative to, and what is ahead.
+    """References of observations, and the limits of an episode.
 
     Attributes:
         center: (K,) prior means of the coefficients.
         std: (K,) their standard deviations.
-        information_rate: (K, K) information about the coefficients that a sample of a swing at the limit brings, times the variance
-            of an output.
+        information_rate: (K, K) information about the coefficients per sample of an oscillation at the limit, times the
+            variance of an output.
         scales: (n,) sizes of the states when the first sensor is at its limit.
         max_input: amplitude limit.
-        max_output: limit that the observations of the first sensor are relative to.
-        limit: that the shield keeps.
+        max_output: limit that observations of the first sensor are relative to.
+        limit: of the shield.
         samples: of an episode.
-        energy: limit of Σ u²; inf where there is none.
-        process_variance: variance that the observation's log E[γ] is relative to.
-        sensor_variance: that of the first sensor's log E[ξ].
-        accumulated_noise: variance by which process noise moves the first sensor before anything can be done about it, in parts of
-            what it does in a sample.
+        energy: limit of Σ u²; inf for none.
+        process_variance: reference of the observation's log E[γ].
+        sensor_variance: reference of the first sensor's log E[ξ].
+        accumulated_noise: variance by which process noise moves the first sensor before an input can correct it, in
+            parts of its variance per sample.
         hold_samples: samples of a move.
         margin: predictive standard deviations that the shield keeps from the limit.
-        step_response: by how much the largest input over a sample from rest moves what the first sensor shows, in parts of the
+        step_response: change of the first sensor's output by the largest input over a sample from rest, in parts of the
             limit.
-        amplitude_growth: where the energy is limited, a push changes the height of a swing by this part of it in a sample, but
-            has no less than the size that what is left would last for.
+        amplitude_growth: where the energy is limited, the change of an oscillation's height by a push, per sample and
+            in parts of the height; a push is at least as large as the remaining energy lasts for.
     """
 
     center: FloatArray
@@ -79,14 +79,15 @@ class FeatureSettings(NamedTuple):
 
 
 class ShieldedFeatures(NamedTuple):
-    """What n observations become.
+    """Features of n observations, and the shield.
 
     Attributes:
-        values: (n, features) float32 what a network sees: all finite and at most `MAX_FEATURE` in size.
-        mirror_signs: (n,) float32, -1 where the observation was turned over.
-        allowed_intervals: (n, 2) float32 the lowest and the highest choice that the shield allows, upright.
-        action_scales: (n,) float32 the action that a choice of 1 stands for, upright: 1, or less where energy is scarce.
-        remaining_information: (n,) float32 what is still to come, ½ log det(I + C J) [nats].
+        values: (n, features) float32 inputs of a network: finite, and at most
+            `agents.policies.networks.feature_names.MAX_FEATURE` in size.
+        mirror_signs: (n,) float32, -1 where the observation was mirrored.
+        allowed_intervals: (n, 2) float32 lowest and highest action that the shield allows, before mirroring.
+        action_scales: (n,) float32 action for a choice of 1, before mirroring: 1, or less where energy is scarce.
+        remaining_information: (n,) float32 expected information of the rest, ½ log det(I + C J) [nats].
     """
 
     values: npt.NDArray[np.float32]
@@ -96,7 +97,7 @@ class ShieldedFeatures(NamedTuple):
     remaining_information: npt.NDArray[np.float32]
 
     def to_actions(self, choices: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """The actions (n, 1) of choices (n,) in [-1, 1], upright: the nearest that the shield allows, turned back."""
+        """Actions (n, 1) for choices (n,) in [-1, 1] of a network: the nearest allowed ones, mirrored back."""
         lowest, highest = self.allowed_intervals.T
         kept = np.minimum(np.maximum(np.asarray(choices, dtype=np.float32), lowest), highest)
         return (kept * self.action_scales * self.mirror_signs)[:, None]
@@ -104,7 +105,7 @@ class ShieldedFeatures(NamedTuple):
 
 @cache
 def _compile_feature_batch(view: ModelView) -> Any:
-    """``encode_batch(observations, setting, own, *features)``: fills in the `ShieldedFeatures` of n observations."""
+    """``encode_batch(observations, setting, with_observation, *features)`` fills in `ShieldedFeatures`."""
     workspace, encode = compile_features(view)
 
     @kernel(variant=view.compile_key)
@@ -131,9 +132,9 @@ class FeatureEncoder:
     """Turns observations of an environment into `ShieldedFeatures`.
 
     Args:
-        setting: what observations are relative to.
-        view: how the believed model is taken.
-        with_observation: whether the observation itself stands behind the features that all models have.
+        setting: references and limits.
+        view: of the believed model.
+        with_observation: whether the observation follows the features.
     """
 
     def __init__(self, setting: FeatureSettings, view: ModelView, *, with_observation: bool = True) -> None:
@@ -141,7 +142,7 @@ class FeatureEncoder:
 
     @classmethod
     def of(cls, env: Any, *, with_observation: bool = True) -> FeatureEncoder:
-        """That of an unwrapped environment, single or vector.
+        """The encoder for an unwrapped environment, single or vector.
 
         Raises:
             ValueError: for an environment that is not one of duffing_env, shows another observation than the
@@ -154,8 +155,8 @@ class FeatureEncoder:
             )
         if experiment.observation != "posterior":
             raise ValueError(
-                f"env must show the observation 'posterior' for features, but shows {short_repr(experiment.observation)}; "
-                "leave out the option observation"
+                f"env must show the observation 'posterior' for features, but shows "
+                f"{short_repr(experiment.observation)}; leave out the option observation"
             )
         if experiment.hold != 1:
             raise ValueError(f"hold must be 1 for features, but is {experiment.hold}; train without features")
@@ -184,10 +185,10 @@ class FeatureEncoder:
 
     @classmethod
     def from_tensor(cls, numbers: npt.ArrayLike, description: dict[str, Any]) -> FeatureEncoder:
-        """That which `to_tensor` and `describe` gave.
+        """The encoder of a `to_tensor` and a `describe`.
 
         Raises:
-            ValueError: for numbers of another count, or that are not those of a setting.
+            ValueError: for another count of numbers, or numbers out of range.
         """
         described = dict(description)
         with_observation, view = bool(described.pop("own")), ModelView(Model(**described.pop("model")), **described)
@@ -209,11 +210,11 @@ class FeatureEncoder:
         return cls(setting, view, with_observation=with_observation)
 
     def to_tensor(self) -> FloatArray:
-        """The setting, flat, as a policy's file holds it."""
+        """The setting as a flat array, for a policy's file."""
         return np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in self.setting])
 
     def describe(self) -> dict[str, Any]:
-        """The rest of it, as JSON can hold it."""
+        """The rest of the encoder, as JSON can hold it."""
         return {
             "own": self.with_observation,
             "model": self.model_view.model.to_dict(),
@@ -228,7 +229,7 @@ class FeatureEncoder:
 
     @property
     def size(self) -> int:
-        """What a network sees."""
+        """Number of features."""
         return len(FEATURE_NAMES) + self.with_observation * self.observation_size
 
     def __call__(self, observations: npt.ArrayLike) -> ShieldedFeatures:

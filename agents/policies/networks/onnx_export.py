@@ -1,4 +1,4 @@
-"""The network of a trained policy as ONNX: ``duffing-env export POLICY --output network.onnx``."""
+"""Export of a trained policy's network as ONNX: ``duffing-env export POLICY --output network.onnx``."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from agents.policies.networks.trained_policy import TrainedPolicy
 from estimator.support.file_io import write_atomically
 from estimator.support.optional_dependencies import require_packages
 
-#: Of the operators that are used; old enough for every runtime of today.
+#: Version of the operators; old enough for current runtimes.
 _OPSET_VERSION = 17
 
 
 def export_network(policy: TrainedPolicy, path: str | Path) -> None:
     """Write the network of a policy as ONNX, in one piece.
 
-    Its input ``observation`` (n, size) float32 is what the layers see: the observation, or with features those of
-    `agents.policies.networks.rollout_features`, which with the shield are not part of the network. Its output ``action`` (n, 1) is the
-    choice in [-1, 1] of the deterministic policy.
+    Its input ``observation`` (n, size) float32 is the observation, or the features of
+    `agents.policies.networks.rollout_features`; features and shield are not part of the network. Its output ``action``
+    (n, 1) is the choice in [-1, 1] of the deterministic policy.
 
     Args:
         policy: without a memory.

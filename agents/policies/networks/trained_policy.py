@@ -1,4 +1,4 @@
-"""Learned policies: weights in a safetensors file, described by a JSON card. Nothing is ever unpickled.
+"""Trained policies, played with NumPy: weights in a safetensors file, described by a JSON card. Nothing is unpickled.
 
 A policy folder holds ``policy.safetensors`` (the tensors of a Stable-Baselines3 policy, by their names there) and
 ``policy.json`` (the card: algorithm, network, what it was trained on). Acting needs the actor only, which is evaluated
@@ -57,11 +57,11 @@ class NetworkCard:
         memory: name of the LSTM before the layers; None for none.
         levels: evenly spaced actions from -1 to 1, of which the last layer has the log probabilities, up to a constant;
             0 where it has the action itself.
-        features: whether the layers see `agents.policies.networks.rollout_features` in place of the observation, and the shield bounds
-            the action. The tensor ``setting`` is what observations are relative to; without it they are that of the
-            environment that is played.
-        normalised: what the layers see is normalised, to at most so many standard deviations, with the tensors
-            ``normalizer.mean`` and ``normalizer.std``; 0 where it is seen as it is.
+        features: whether the layers take `agents.policies.networks.rollout_features` in place of the observation, and
+            the shield bounds the action. The tensor ``setting`` has the references of observations; without it they
+            are those of the environment that is played.
+        normalised: largest normalised input in standard deviations, with the tensors ``normalizer.mean`` and
+            ``normalizer.std``; 0 without normalisation.
     """
 
     layers: tuple[str, ...]
@@ -83,7 +83,7 @@ class TrainedPolicy:
         card: see below.
         network: see below.
         layers: weight (out, in) and bias (out,) of each.
-        normalizer: mean and standard deviation of what they see, and how many of these they see at most; or None.
+        normalizer: mean and standard deviation of their inputs, and the largest normalised input; or None.
 
     Args:
         network: which tensors make it up, and how.
@@ -148,16 +148,16 @@ class TrainedPolicy:
         """Play this unwrapped environment, with its prior, limits and noises, instead of that of the training.
 
         Raises:
-            ValueError: for an environment that shows another observation than the policy learned from, where its card
-                says which. Of a policy with features: for one that `FeatureEncoder.of` refuses, or that is of another model
-                than a policy was trained on that sees the observation itself, too.
+            ValueError: for an environment with another observation than the card of the policy names. With features:
+                for one that `FeatureEncoder.of` refuses, or of another model than the training's, for a policy that
+                takes the observation as well.
         """
         shown = observation_name(env)
         if None not in (self._observation_name, shown) and shown != self._observation_name:
             wanted = "your function" if self._observation_name == "own" else repr(self._observation_name)
             raise ValueError(
-                f"env must show the observation {self._observation_name!r}, which the policy learned from, but shows {shown!r}; "
-                f"make it with the option observation={wanted}"
+                f"env must show the observation {self._observation_name!r}, which the policy learned from, but shows "
+                f"{shown!r}; make it with the option observation={wanted}"
             )
         if self.network.features:
             self._encoder = self._check_encoder(
@@ -165,7 +165,7 @@ class TrainedPolicy:
             )
 
     def _check_encoder(self, encoder: FeatureEncoder) -> FeatureEncoder:
-        """A map that gives what the network takes."""
+        """The encoder, if its features are those of the network."""
         model = self._description.get("model")
         if encoder.size != self._n_inputs or (
             encoder.with_observation and model is not None and encoder.model_view.model != Model(**model)
@@ -218,7 +218,7 @@ class TrainedPolicy:
     def _network_output(
         self, hidden: FloatArray, state: Any, episode_start: npt.ArrayLike | None, deterministic: bool
     ) -> tuple[FloatArray, Any]:
-        """What the network gives for what it sees, (n, 1) or (1,), and the next state."""
+        """The network's action (n, 1) or (1,) for its inputs, and the next state."""
         if self.normalizer is not None:
             mean, std, max_deviations = self.normalizer
             hidden = np.clip((hidden - mean) / std, -max_deviations, max_deviations)
@@ -247,7 +247,7 @@ class TrainedPolicy:
 
 
 def observation_name(env: Any) -> str | None:
-    """What an unwrapped environment shows, by its name; "own" for a function, and None for an environment of others."""
+    """The name of an unwrapped environment's observation; "own" for a function, None for a foreign environment."""
     shown = getattr(getattr(env, "experiment", None), "observation", None)
     return shown if shown is None or isinstance(shown, str) else "own"
 
@@ -311,5 +311,5 @@ def load_policy(folder: str | Path, seed: int = 0) -> TrainedPolicy:
         )
     try:
         return TrainedPolicy(NetworkCard(**card["network"]), tensors, card, seed)
-    except Exception as error:  # whatever a card of somebody else's makes of the readers
+    except Exception as error:  # a foreign card may raise anything
         raise ValueError(f"policy must be what its card says, but {folder} is not: {error!r}; copy it anew") from error
