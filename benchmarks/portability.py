@@ -31,8 +31,8 @@ COMPILED = (
     "tests/duffing_env/test_plant.py",
     "tests/duffing_env/test_rewards.py",
     "tests/duffing_env/test_simulation.py",
-    "tests/agents/test_design.py",
-    "tests/agents/test_planner.py",
+    "tests/agents/test_d_optimality.py",
+    "tests/agents/test_efe_planner.py",
     "tests/research/benchmarks/test_coverage.py",
     "tests/research/benchmarks/test_roofline.py",
     "tests/research/benchmarks/test_pieces.py",
@@ -40,9 +40,9 @@ COMPILED = (
 #: Networks, beside torch's.
 NETWORKS = (
     "tests/agents/test_evaluation.py",
-    "tests/agents/test_features.py",
-    "tests/agents/test_learned.py",
-    "tests/agents/test_vec_env.py",
+    "tests/agents/test_rollout_features.py",
+    "tests/agents/test_trained_policy.py",
+    "tests/agents/test_sb3_vec_env.py",
 )
 #: What NumPy and SciPy compute.
 ARRAYS = (

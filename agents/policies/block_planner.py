@@ -83,7 +83,7 @@ class BlockPlanner:
         seed: of the search and of the draws.
         block: samples of a block.
         risk: probability, as believed, that an episode leaves its range. Blocks share half of it equally. Of the other
-            half each block takes half of the rest, as the first ones have the widest beliefs, and the last one takes all.
+            half each block takes half of the rest, as the first beliefs are the widest, and the last one takes all.
 
     Raises:
         ValueError: as `EfePlanner`; for a design or a run, which plan blocks of ``efe``; for a block below 1 or above

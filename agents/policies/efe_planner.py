@@ -40,6 +40,7 @@ neither ``max_slew`` nor ``drift`` into account.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -243,7 +244,7 @@ class EfePlanner:
         """
         rows, episode_begins = self.checked_rows(observation, state, EfePlannerState, episode_start)
         records, objective = self._env.records, self.objective
-        state = self._new_state(len(rows)) if state is None else EfePlannerState(*(part.copy() for part in state))
+        state = self._new_state(len(rows)) if state is None else deepcopy(state)
         older_inputs, remaining_holds = state.last_inputs, state.remaining_holds
         for part in (state.plans, state.runner_ups, state.information_rates, older_inputs, remaining_holds):
             part[episode_begins] = 0

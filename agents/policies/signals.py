@@ -1,8 +1,8 @@
 """Open-loop policies: they play excitation signals, and do not use the observation.
 
 `SignalPolicy` plays a `SignalDraw` of `agents.policies.excitations` through Stable-Baselines3's `predict`, one signal
-for each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the length
-of its episodes, and to its input budget where it has one. `agents.policies.make_policy` calls it by name.
+for each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the
+length of its episodes, and to its input budget where it has one. `agents.policies.make_policy` calls it by name.
 """
 
 from dataclasses import dataclass

@@ -35,9 +35,11 @@ from estimator.models.model import Model
 _STAGE_WEIGHTS = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), sp.S.Half),
            "C": (sp.Rational(1, 3), sp.S.One), "D": (sp.Rational(1, 6), sp.S.Zero)}  # fmt: skip
 
-#: Runge-Kutta steps of the state over a predicted sample, for models with at least that many. Two steps have errors
-#: above the noise at five samples per period, and plans then exceed the output's limit.
-_COARSE_STEPS = 4
+#: Runge-Kutta steps of the state over a sample that is only imagined: the first number where the model takes as many or
+#: more, else the second. What is linear takes one step, whose stages are begin, middle and end of the sample. Two steps
+#: are wrong by more than the noise where a period has five samples (tests/agents/test_belief_rollout.py), and peaks then
+#: lie beyond where they are planned.
+_COARSE_STEPS, _MIN_COARSE_STEPS = 4, 2
 
 #: Runge-Kutta steps over a predicted sample, for all other models.
 _MIN_COARSE_STEPS = 2

@@ -170,8 +170,8 @@ def refine_input(
     Args:
         model: the equation.
         degree: of the input's polynomial over a sample.
-        nominal: what the worth is taken at.
-        limits: to be kept; ``soft_limit`` is the limit of the signal in programmes. The energy may be exceeded a little.
+        nominal: the system and its prior precision.
+        limits: of the input; ``soft_limit`` is the signal's in programmes. The energy may be exceeded a little.
         state_scales: (n,) of the states (`agents.planning.time_scales.TimeScales`).
         u: (T,) inputs, which may be beyond the limits of signal and energy.
         quantum: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a

@@ -1,6 +1,6 @@
 """Comparison of policies with the planner on unseen oscillators of the family.
 
-    python -m research.studies.unseen_oscillators --policies ppo/universal shield prbs prbs-4 uniform silverbox-multisine
+    python -m research.studies.unseen_oscillators --policies ppo/universal shield prbs uniform silverbox-multisine
 
 plays every policy on the same oscillators, one of each rig drawn by
 `agents.training.environments.oscillator_family`, in the branch ``test`` of the seeds. D-efficiency is

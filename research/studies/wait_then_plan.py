@@ -1,7 +1,7 @@
 """Baseline of `ppo/drift`, without learning: wait until the mass has jumped, then play the planner.
 
-    python evaluate.py --env Drift-v0 --systems 128 \\
-        --policies research.studies.wait_then_plan:WaitThenPlan ppo/drift efe
+    python evaluate.py --env Drift-v0 --systems 128 --policies
+        research.studies.wait_then_plan:WaitThenPlan ppo/drift efe
 
 The mass of Drift-v0 jumps at a random sample, and before sample 390. The policy pushes one way until then, so that the
 oscillator rests, and plays the planner afterwards.

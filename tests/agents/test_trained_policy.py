@@ -447,7 +447,7 @@ def test_the_search_for_unpicklers_finds_them(source):
     assert len(list(unpickling(source))) >= 1
 
 
-@pytest.mark.parametrize("name", ["ppo/drift", "ppo/short"])  # of the others: tests/research/test_ship.py
+@pytest.mark.parametrize("name", ["ppo/drift", "ppo/short"])  # of the others: tests/research/test_ship_policy.py
 def test_a_policy_that_ships_does_what_its_card_says(name):
     card = make_policy(name).card
     (evaluation,) = evaluate_policies([name], card["config"]["env"], systems=32)
