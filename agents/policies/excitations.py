@@ -2,8 +2,8 @@
 
 `EXCITATIONS` makes a `SignalDraw`, which can be copied and pickled, from an amplitude limit. Every draw is new: band
 and levels of a signal are fixed; phase, order or start are random. The sampling rate is 610.35 Hz (δ = 1.6384 ms); an
-input is held for a sample. `agents.policies.signals.SignalPolicy` plays them within a track's limits. docs/policies.md has
-a table of them with their frequency content.
+input is held for a sample. `agents.policies.signals.SignalPolicy` plays them within a track's limits. docs/policies.md
+has a table of them with their frequency content.
 """
 
 from __future__ import annotations

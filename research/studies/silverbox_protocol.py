@@ -197,7 +197,7 @@ def identify(setting: IdentificationSetting, training: Regime, samples: int) -> 
 
 
 def simulation_error(estimator: OnlineEstimator, test: Regime) -> FloatArray:
-    """(T,) simulated minus measured outputs [V]; a simulation takes the inputs and the first `N_GIVEN_OUTPUTS` outputs."""
+    """(T,) simulated minus measured outputs [V]; simulated from the inputs and the first `N_GIVEN_OUTPUTS` outputs."""
     return estimator.simulate(test.u, test.y[:N_GIVEN_OUTPUTS]) - test.y
 
 
@@ -207,7 +207,7 @@ def rmse(error: FloatArray) -> float:
 
 
 def samples_until_close(learning: Mapping[int, float]) -> int | None:
-    """The number of samples from which on the error [V] of a learning curve is below `CLOSE_ERROR`; None without one."""
+    """The number of samples from which on the error [V] of a learning curve is below `CLOSE_ERROR`, or None."""
     far = [samples for samples, error in learning.items() if not error < CLOSE_ERROR]
     close = [samples for samples in learning if not far or samples > far[-1]]
     return close[0] if close else None

@@ -1,4 +1,4 @@
-"""The features of `agents.policies.networks.rollout_features` for Eq. (2), with matrices, one observation at a time.
+"""Features of an observation of Eq. (2) as `agents.policies.networks.rollout_features`, with matrices, one by one.
 
 The motion is x⁺ = θ·φ with φ = (x, x³, x₋, u); the sensor shows x.
 """
