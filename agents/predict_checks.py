@@ -1,4 +1,4 @@
-"""What a policy is asked, checked: the state of the last call, which episodes begin, and how long a signal may be."""
+"""Checks of the arguments of `predict`: observation, state and episode starts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_SAMPLES = 2**22
 
 
 def check_state(state: Any, n_arrays: int) -> None:
-    """Refuse what no policy of so many arrays returned."""
+    """Refuse a state that is not a tuple of ``n_arrays`` arrays."""
     parts = state if isinstance(state, tuple) else (state,)
     if len(parts) != n_arrays or not all(isinstance(part, np.ndarray) and part.ndim for part in parts):
         raise ValueError(f"state must be what the last call returned, or None, but is {short_repr(state)}")

@@ -1,4 +1,4 @@
-"""Our vector environment as Stable-Baselines3's `VecEnv`."""
+"""The vector environment as Stable-Baselines3's `VecEnv`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TRUNCATED = "TimeLimit.truncated"
 
 
 class BatchVecEnv(VecEnv):
-    """A `VecEnv` that is one batch: what a method of the batch gives stands for every row."""
+    """A `VecEnv` that is one batch: a result of a method of the batch applies to every row."""
 
     def __init__(self, *arguments: Any) -> None:
         #: Attributes of a caller's own, by name and row.
@@ -92,7 +92,7 @@ class DuffingVecEnv(BatchVecEnv):
             ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
         num_envs: number of rows; that of ``env`` where it was made.
         seed: of the batch; the next reset uses it.
-        levels: an action is one of so many evenly spaced inputs from -1 to 1, by its number; 0: any input between.
+        levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by its index; 0: any input between.
         options: of the environment, and ``threads``.
 
     Raises:
@@ -220,7 +220,7 @@ class DuffingVecEnv(BatchVecEnv):
 
     @property
     def _step_info_names(self) -> tuple[str, ...]:
-        """What is told of every step."""
+        """Names of the infos of every step."""
         return (*self._batch.single_env_class._info_gains, *self._batch.single_env_class._info_flags)
 
     @property
@@ -230,7 +230,7 @@ class DuffingVecEnv(BatchVecEnv):
 
 
 def infos_by_row(infos: dict[str, Any], names: Sequence[str], n_rows: int, **others: Any) -> list[dict[str, Any]]:
-    """What a vector environment's infos tell of each row, as infos of single environments, and what all have alike."""
+    """A vector environment's infos, row by row as infos of single environments, and common entries."""
     template = dict.fromkeys(names, 0.0) | {name: False for name in names if infos[name].dtype == np.bool_} | others
     row_infos = [template.copy() for _ in range(n_rows)]
     for name in names:
@@ -241,7 +241,7 @@ def infos_by_row(infos: dict[str, Any], names: Sequence[str], n_rows: int, **oth
 
 
 def info_of_row(infos: dict[str, Any], row: int) -> dict[str, Any]:
-    """What a vector environment's infos tell of a row, as a single environment's info."""
+    """A vector environment's infos of one row, as a single environment's info."""
     row_info = {
         name: values[row] for name, values in infos.items() if not name.startswith("_") and infos[f"_{name}"][row]
     }

@@ -1,7 +1,7 @@
-"""The systems of a track that input is designed for, and their oracle: D-optimal inputs at the true parameters, stored.
+"""Oracle of a track: stored D-optimal inputs at the true parameters of its first systems, for D-efficiency.
 
-`research.oracles.oracle_search` finds them. The worth of inputs has many summits, and the best one found is only a
-lower bound of the highest. So whoever finds a better input puts it in its place.
+`research.oracles.oracle_search` finds them. The criterion has many local maxima, so the best input found is only a
+lower bound, and a better one replaces it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from estimator.support.file_io import write_atomically
 
 ORACLE_FOLDER = Path(__file__).parents[1] / "oracles"
 
-#: Inputs are stored as whole numbers, of which this one stands for the largest.
+#: Inputs are stored as whole numbers; this one is the largest input.
 QUANTISATION_LEVELS = 32767
 
 
@@ -39,8 +39,8 @@ class TrackSystems:
     """The first systems of a track, by row.
 
     Attributes:
-        experiment: what they are drawn for.
-        theta: (n, K) their coefficients.
+        experiment: of the track.
+        theta: (n, K) coefficients of the systems.
         precision: (K, K) Λ0.
         variances: (n, 1 + p) of the process noise and of each sensor's.
     """
@@ -52,7 +52,7 @@ class TrackSystems:
 
     @classmethod
     def of(cls, env_id: str, n_systems: int, options: dict[str, Any] | None = None) -> TrackSystems:
-        """The first systems of a track, as they are evaluated with seed 0: of the branch ``test``, if not told another.
+        """The first systems of a track, as they are evaluated with seed 0: of the branch ``test`` by default.
 
         Raises:
             ValueError: where its plant is not simulated, or changes.
@@ -71,13 +71,13 @@ class TrackSystems:
         return cls(experiment, plant.coefficients_of(envs.truth), precision, variances)
 
     def rows(self, first: int, stop: int) -> TrackSystems:
-        """Some of them."""
+        """The systems of some rows."""
         chosen = slice(first, stop)
         return replace(self, theta=self.theta[chosen], variances=self.variances[chosen])
 
     @property
     def plant(self) -> PlantModel:
-        """What they obey."""
+        """The model of the plant."""
         return plant_model_of(self.experiment)
 
     @property
@@ -87,7 +87,7 @@ class TrackSystems:
 
     @property
     def limits(self) -> DesignLimits:
-        """What inputs must keep, over an episode."""
+        """Limits of the inputs of an episode."""
         experiment = self.experiment
         energy = np.inf if experiment.max_rms is None else experiment.max_rms**2 * experiment.samples
         return DesignLimits(experiment.max_output, experiment.max_output, experiment.max_input, energy)
@@ -99,9 +99,9 @@ class TrackSystems:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Everything that the worth of an input, and which inputs are allowed, depend on.
+        """Everything that the criterion of an input and its limits depend on.
 
-        The paper's equation goes without saying, as it does in what was stored first.
+        The model is left out where it is Eq. (2), so that the first stored oracles keep their names.
         """
         experiment, plant = self.experiment, self.plant
         option_names = ("max_input", "max_output", "samples", "process_noise", "measurement_noise", "spread")
@@ -124,13 +124,13 @@ class TrackSystems:
         return ORACLE_FOLDER / f"{self.samples}-samples-{digest}.npz"
 
     def nominal_system(self, row: int) -> NominalSystem:
-        """What the worth of an input to one system is taken at."""
+        """One system and its prior precision, for the criterion."""
         return NominalSystem(self.theta[row].copy(), self.precision, tuple(self.variances[row]))
 
     def criterion_and_peak(self, inputs: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Worth ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
+        """The criterion ½ log det(Λ0 + F) [nats], and peak displacement without noise [V], of inputs (n, samples) [V].
 
-        Each (n,). Inputs that are not finite, as after the end of an episode, tell nothing from there on.
+        Each (n,). Inputs that are not finite, as after the end of an episode, end there.
         """
         u = np.array(inputs, dtype=np.float64)
         if u.ndim != 2 or len(u) > len(self.theta):
@@ -162,9 +162,9 @@ class Oracle:
     Attributes:
         systems: that they are for.
         inputs: (n, samples) [V].
-        values: (n,) their worth [nats].
-        bounds: (n,) what no admissible input is worth more than [nats] (`research.oracles.certificate`); NaN where
-            nobody has found one.
+        values: (n,) their criterion [nats].
+        bounds: (n,) upper bounds of it over admissible inputs [nats] (`research.oracles.certificate`); NaN where none
+            is stored.
     """
 
     systems: TrackSystems
@@ -205,7 +205,7 @@ class Oracle:
             return len(stored["theta"])
 
     def head(self, count: int) -> Oracle:
-        """That of the first systems."""
+        """The oracle of the first systems."""
         return Oracle(self.systems.rows(0, count), self.inputs[:count], self.values[:count], self.bounds[:count])
 
     def save(self) -> Path:

@@ -19,7 +19,7 @@ import duffing_env
 from agents.planning.model_probe import ModelView
 from agents.planning.open_loop import chance_constrained_block
 from agents.planning.plan_objective import PlanObjective
-from agents.planning.receding_horizon import compile_receding_horizon
+from agents.planning.receding_horizon import PlanArrays, compile_receding_horizon
 from agents.planning.time_scales import probe_time_scales, recoverable_step
 from agents.policies import block_planner, make_policy
 from agents.policies.block_planner import BlockPlanner
@@ -255,7 +255,7 @@ def test_a_planner_needs_an_environment_of_its_own():
     with pytest.raises(ValueError, match="env must be an environment of duffing_env"):
         EfePlanner(SimpleNamespace(max_input=0.1))
     policy = make_policy("efe", gym.make("duffing_env/Amplitude-v0"))
-    with pytest.raises(ValueError, match="planner's own 1 environments"):
+    with pytest.raises(ValueError, match="of the 1 environments of this planner"):
         policy.predict(np.zeros((3, 22)))
 
 
@@ -463,7 +463,7 @@ def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
         rates, words = rate[None].copy(), rng.integers(1, 2**63, (1, 4), dtype=np.uint64)
         arguments = belief.record[None].copy(), np.array([left]), horizon, 60, terms, np.zeros((1, 2))
         compile_receding_horizon(difference()).plan(
-            *arguments, plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64)
+            *arguments, PlanArrays(plans, others, rates, words, np.empty(1), np.empty(1, dtype=np.int64))
         )
 
         def worth(inputs, belief=belief, rate=rate):
