@@ -133,7 +133,7 @@ def probe_time_scales(view: ModelView, prior_means: npt.ArrayLike, max_input: fl
     )
     sizes, (peak, period, rise_time, step_response) = peaks[:-4], peaks[-4:]
     sensor = next(iter(model.outputs.values()))
-    moves = zip(model.states, model.moves, strict=True)
+    moves = zip(model.states, model.update_expressions, strict=True)
     has_sensor_scale = np.array([x == sensor or (not model.is_continuous and move == sensor) for x, move in moves])
     has_sensor_scale |= (sizes <= 0) | (peak <= 0)
     scales = limit * np.divide(sizes, peak, out=np.ones(model.n_states), where=~has_sensor_scale)
