@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import platform
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-
 from estimator.support.argument_checks import mask_control_codes
-from estimator.support.file_io import check_writable, write_atomically
 from estimator.support.progress import MAX_LINE_WIDTH
 
 
@@ -125,59 +118,3 @@ def split_to_width(make_table: Callable[[Sequence[int]], Any], n_columns: int, n
 
 #: Of what is measured, and of a label [characters].
 _UNBOUNDED_WIDTH, _MAX_LABEL_WIDTH = 10_000, 32
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file in one piece; a number that is not finite, as null.
-
-    Raises:
-        OSError: where it cannot be written.
-    """
-    write_atomically(
-        path, json.dumps(replace_non_finite(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    )
-
-
-def replace_non_finite(content: Any) -> Any:
-    """What JSON can hold: a number that is not finite becomes null."""
-    if isinstance(content, dict):
-        return {key: replace_non_finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [replace_non_finite(value) for value in content]
-    return None if isinstance(content, float) and not np.isfinite(content) else content
-
-
-def check_output_file(name: str, path: Path | None) -> None:
-    """Refuse a folder where a file is to be written, and where none can be, before the work begins.
-
-    Raises:
-        IsADirectoryError: naming the argument.
-        OSError: naming the path, where it cannot be written.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise IsADirectoryError(f"{name} must be a file, but is the folder {path}; name a file in it")
-    check_writable(path)
-
-
-def check_output_folder(name: str, path: Path) -> None:
-    """Refuse a file where a folder is to be, and where none can be written to, before the work begins.
-
-    Raises:
-        NotADirectoryError: naming the argument.
-        OSError: naming the path, where nothing can be written.
-    """
-    for place in (path, *path.parents):
-        if place.exists() and not place.is_dir():
-            raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
-    check_writable(path)
-
-
-#: What the numbers of a result depend on.
-VERSIONED_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
-
-
-def package_versions(*packages: str) -> dict[str, str]:
-    """Of Python, of `VERSIONED_PACKAGES`, and of these packages."""
-    return {"python": platform.python_version(), **{name: version(name) for name in (*VERSIONED_PACKAGES, *packages)}}

@@ -16,14 +16,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from agents.cli import check_track_id, full_track_id, iterate_with_progress, run_script
+from agents.cli import run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.comparison import default_policies
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy, trained_policies
+from agents.track_ids import check_track_id, full_track_id
 from agents.user_code import attribute_user_errors
 from estimator.support.argument_checks import check_choice, check_integer
 from estimator.support.optional_dependencies import require_packages
+from estimator.support.progress import iterate_with_progress
 
 #: Grade to the policy that plays it; the expert is the one that ships for the track.
 POLICIES = {"random": "uniform", "medium": "velocity-sign", "planner": "efe"}

@@ -32,7 +32,7 @@ class Interrupted(BaseException):
 class InterruptHandler:
     """Catches signals while it is entered, in the main thread.
 
-    A signal is noticed by `check`, between two commands to the plant, so that none is cut in two. A command or a
+    A signal is noticed by `raise_if_interrupted`, between two commands to the plant, so that none is cut in two. A command or a
     policy that does not come back within ``patience`` seconds is interrupted.
     """
 
@@ -58,7 +58,7 @@ class InterruptHandler:
         """Whether a signal came."""
         return self._signum is not None
 
-    def check(self, resume_hint: str = "") -> None:
+    def raise_if_interrupted(self, resume_hint: str = "") -> None:
         """Raise `Interrupted` where a signal came; ``resume_hint`` says what is left."""
         if self._signum is not None:
             self._cancel_timer()

@@ -168,14 +168,14 @@ class DuffingVecEnv(BatchVecEnv):
         return observations
 
     @property
-    def memory(self) -> dict[str, npt.NDArray[Any]]:
-        """As `DuffingVectorEnv.memory`."""
+    def episode_state(self) -> dict[str, npt.NDArray[Any]]:
+        """As `DuffingVectorEnv.episode_state`."""
         return self._batch.memory | {"returns": self._returns, "lengths": self._lengths}
 
-    def recall(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
+    def restore_episode_state(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
         """Go on with the episodes that a copy of `memory` is of, and see what was seen then."""
         observations = self.reset()
-        for name, array in self.memory.items():
+        for name, array in self.episode_state.items():
             array[...] = memory[name]
         return observations
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.cli import run_script
-from agents.console_output import package_versions, write_json
+from agents.result_files import package_versions, write_json
 from benchmarks.peer_process import Peers
 from benchmarks.section_tables import Section, print_section, print_verdicts
 from benchmarks.timed_rounds import CORES

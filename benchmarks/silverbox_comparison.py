@@ -14,7 +14,8 @@ from typing import Any, cast
 import numpy as np
 
 from agents.cli import run_script
-from agents.console_output import format_table, print_texts_and_tables, replace_non_finite
+from agents.console_output import format_table, print_texts_and_tables
+from agents.result_files import replace_non_finite
 from benchmarks.peer_process import NotAvailable, Peers
 from benchmarks.section_tables import ratio
 from benchmarks.timed_rounds import Result, Row, measure, timed

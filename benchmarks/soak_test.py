@@ -21,13 +21,14 @@ import gymnasium as gym
 import numpy as np
 
 import duffing_env  # noqa: F401  registers the tracks
-from agents.cli import iterate_with_progress, run_script
+from agents.cli import run_script
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.tracks.track_registry import TRACKS
 from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import check_belief_record, covariance_indices
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
+from estimator.support.progress import iterate_with_progress
 
 _ROWS = 1024
 

@@ -14,7 +14,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.comparison_tables import summarise_metrics
+from agents.evaluation.metric_summary import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.policies.networks.trained_policy import CARD_FILE
 from agents.training import PPOSettings, TrainConfig

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.console_output import format_table, print_texts_and_tables, write_json
+from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy
+from agents.result_files import write_json
 from benchmarks.interval_coverage import NO_LIMIT, QUANTILE
 from benchmarks.rigs.calibration import judge_coverage
 from estimator.inference.noise_grid import NoiseGridSize

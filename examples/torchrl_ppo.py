@@ -15,9 +15,10 @@ import torch
 from torch import nn
 
 from agents import save_policy
-from agents.cli import full_track_id, run_script
-from agents.console_output import package_versions
+from agents.cli import run_script
 from agents.policies.networks.policy_saving import check_policy_folder
+from agents.result_files import package_versions
+from agents.track_ids import full_track_id
 
 try:
     from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule

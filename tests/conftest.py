@@ -44,8 +44,8 @@ def jumping_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     from agents.hardware.clock import JumpingClock
 
     clock = JumpingClock()
-    for module in ("run", "simulated"):
-        monkeypatch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
+    for module in ("experiment_run", "simulated_plant"):
+        monkeypatch.setattr(f"agents.hardware.{module}.RealClock", lambda: clock)
 
 
 @pytest.fixture(autouse=True)

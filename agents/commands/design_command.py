@@ -39,9 +39,9 @@ class DesignCommand:
 
     def run(self) -> None:
         """Design, print what is to be expected, and write the signal."""
-        from agents.cli import check_distinct_files, check_not_overwritten
         from agents.console_output import print_wrapped
         from agents.hardware.next_experiment import design_experiment
+        from agents.output_paths import check_distinct_files, check_not_overwritten
         from estimator.saving import load_estimator
         from estimator.support.optional_dependencies import require_packages
         from estimator.support.progress import show_progress
@@ -98,12 +98,12 @@ def print_experiment_design(experiment_design: Any) -> None:
         for digits in [digits_to_distinguish(low, high, 5)]
     ]
     description = f"{len(experiment_design.u)} samples by {experiment_design.policy}, up to {abs(experiment_design.u).max():.3g} {experiment_design.rig.input.unit}"
-    description += f", made smaller to {experiment_design.share:.2g} of it" if experiment_design.share < 1 else ""
+    description += f", made smaller to {experiment_design.scale:.2g} of it" if experiment_design.scale < 1 else ""
     print_all(
         format_table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
         f"{description}; {experiment_design.information_gain:.1f} nats more; out of the range with a probability of at most {experiment_design.exit_probability:.1g}.",
     )
-    if len(set(experiment_design.u.tolist())) == 1 and experiment_design.share > 0:
+    if len(set(experiment_design.u.tolist())) == 1 and experiment_design.scale > 0:
         message = f"every input is the same: {experiment_design.policy} holds its values for longer than {len(experiment_design.u)} samples here"
         print_warning(f"{message}; choose another signal, or more samples")
     if experiment_design.samples_per_period < MIN_SAMPLES_PER_PERIOD:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from agents.cli import RIG_TRACK, JsonOptions, check_track_id, full_track_id, options_with_rig
+from agents.json_options import JsonOptions
+from agents.track_ids import RIG_TRACK, check_track_id, full_track_id, options_with_rig
 
 #: What goes with a protocol.
 _PROTOCOL_OPTIONS = ("policies", "protocol", "submit", "samples", "board")
@@ -87,13 +88,8 @@ class EvaluateCommand:
 
     def _run_protocol(self, protocol: str) -> None:
         from agents.console_output import format_table, print_texts_and_tables, print_wrapped
-        from agents.leaderboard.leaderboard_file import (
-            COLUMN_TITLES,
-            LEADERBOARD_CAPTION,
-            append_entry,
-            check_new_entry,
-            entry_cells,
-        )
+        from agents.leaderboard.leaderboard_file import append_entry, check_new_entry
+        from agents.leaderboard.leaderboard_tables import COLUMN_TITLES, LEADERBOARD_CAPTION, entry_cells
         from agents.leaderboard.protocol import measure_policy
         from estimator.support.progress import show_progress
 

@@ -39,8 +39,8 @@ class ExportCommand:
         """Write it, and say what it is."""
         import numpy as np
 
-        from agents.cli import check_not_overwritten
         from agents.console_output import print_wrapped
+        from agents.output_paths import check_not_overwritten
         from agents.policies.signal_export import export_signal
         from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 

@@ -40,8 +40,8 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Identify, print, and write the page."""
-        from agents.cli import check_distinct_files
         from agents.console_output import print_wrapped
+        from agents.output_paths import check_distinct_files
         from estimator import identify
 
         if Path(self.rig).suffix.lower() in (".csv", ".mat"):

@@ -21,9 +21,9 @@ class ReportCommand:
 
     def run(self) -> None:
         """Print the tables, and write the page."""
-        from agents.cli import check_distinct_files
         from agents.console_output import format_table, print_texts_and_tables
-        from agents.leaderboard import leaderboard_file
+        from agents.leaderboard import leaderboard_file, leaderboard_tables
+        from agents.output_paths import check_distinct_files
 
         check_distinct_files({"output": self.output}, [self.board or leaderboard_file.OWN_LEADERBOARD])
         own_leaderboard = (
@@ -42,10 +42,10 @@ class ReportCommand:
         # What is printed needs no file, and comes also where none can be written.
         try:
             if self.output is not None:
-                leaderboard_file.write_leaderboard_page(self.output, list(entries.values()))
+                leaderboard_tables.write_leaderboard_page(self.output, list(entries.values()))
         finally:
-            for track, rows in leaderboard_file.leaderboard_rows(list(entries.values())).items():
-                print_texts_and_tables(f"\n{track}", format_table(leaderboard_file.COLUMN_TITLES, rows))
-            print_texts_and_tables(leaderboard_file.LEADERBOARD_CAPTION)
+            for track, rows in leaderboard_tables.leaderboard_rows(list(entries.values())).items():
+                print_texts_and_tables(f"\n{track}", format_table(leaderboard_tables.COLUMN_TITLES, rows))
+            print_texts_and_tables(leaderboard_tables.LEADERBOARD_CAPTION)
         if self.output is not None:
             print_texts_and_tables(f"The page is {self.output}")

@@ -39,7 +39,9 @@ class RigInitCommand:
         """Write it."""
         from agents.cli import check_not_overwritten
         from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record
+        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, to_toml
         from agents.console_output import print_wrapped
+        from agents.output_paths import check_not_overwritten
         from estimator.rigs.rig import SHIPPED_RIGS
         from estimator.support.file_io import write_atomically
 

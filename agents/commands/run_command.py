@@ -56,10 +56,10 @@ class RunCommand:
             if hasattr(plant, "close"):
                 plant.close()
         print_run_result(result)
-        if result.ended == "zero":
+        if result.outcome == "zero":
             print_wrapped(f"duffing-env: complete, but {result.message}", sys.stderr)
         elif result.exit_status:
-            print_wrapped(f"duffing-env: ended early ({result.ended}): {result.message}", sys.stderr)
+            print_wrapped(f"duffing-env: ended early ({result.outcome}): {result.message}", sys.stderr)
         elif result.message:
             print_warning(result.message)
         sys.exit(result.exit_status)
@@ -75,7 +75,11 @@ def print_run_result(result: Any) -> None:
         [name, f"{mean:.5g}", f"{intervals[name][0]:.5g} to {intervals[name][1]:.5g}", units[name]]
         for name, (mean, _) in result.parameters.items()
     ]
-    late = f"{result.late} ticks of the clock were missed" if result.late else "no tick of the clock was missed"
+    late = (
+        f"{result.late_ticks} ticks of the clock were missed"
+        if result.late_ticks
+        else "no tick of the clock was missed"
+    )
     print_all(
         format_table(("", "mean", "90 % interval", "unit"), rows),
         f"{late}; the samples are {result.folder}/samples.csv",

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.cli import RIG_TRACK
-from agents.console_output import check_output_file, check_output_folder, print_wrapped
+from agents.console_output import print_wrapped
 from agents.evaluation.comparison_tables import (
     print_comparison_table,
     print_estimator_table,
@@ -16,8 +15,10 @@ from agents.evaluation.comparison_tables import (
     write_evaluations,
 )
 from agents.evaluation.policy_evaluation import Evaluation, evaluate_policies
+from agents.output_paths import check_output_file, check_output_folder
 from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import load_policy
+from agents.track_ids import RIG_TRACK
 from agents.user_code import env_spec_of
 from duffing_env.plants.silverbox_record import record_available
 from estimator.support.optional_dependencies import install_hint, is_not_installed, require_packages

@@ -192,7 +192,7 @@ def plot_experiment_design(experiment_design: ExperimentDesign) -> Figure:
     figure, rig = new_figure(9, 5), experiment_design.rig
     above, below = figure.subplots(2, 1, sharex=True)
     time = rig.step * np.arange(len(experiment_design.u))
-    low, median, high = experiment_design.shown
+    low, median, high = experiment_design.output_quantiles
     above.plot(time, experiment_design.u, color=_COLOURS[0], linewidth=1.0, zorder=3, drawstyle="steps-post")
     above.set(
         ylabel=f"input / {rig.input.unit}", title=f"{len(experiment_design.u)} samples by {experiment_design.policy}"

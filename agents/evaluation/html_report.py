@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.console_output import package_versions
 from agents.evaluation.comparison_tables import (
     AUDITOR_EXPLANATION,
     comparison_table,
@@ -22,6 +21,7 @@ from agents.evaluation.figures import (
     plot_posterior_contraction,
 )
 from agents.evaluation.policy_evaluation import Evaluation
+from agents.result_files import package_versions
 from estimator.support.file_io import write_atomically
 from estimator.support.html_page import figure_to_svg, html_document, html_table
 

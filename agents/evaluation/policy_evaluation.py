@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation import metrics
-from agents.evaluation.plant_model import plant_model_of
+from agents.evaluation.estimator_comparison import estimate_with_other_estimators
 from agents.evaluation.policy_groups import (
     check_policies_can_play,
     check_predict_signature,
@@ -25,27 +25,20 @@ from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
 from estimator.belief import Belief
-from estimator.inference.batch_posteriors import posteriors
-from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import coefficients_of
-from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import MAX_SEED, check_integer, mask_control_codes
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
 
-#: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
-AUDITOR = "auditor"
 #: Systems that one evaluation keeps in memory, with all that they did.
 _MAX_SYSTEMS = 100_000
 
 #: Of the time that a policy takes, about so much is playing.
 _EPISODE_TIME_FRACTION = 0.7
-
-FACTORISATIONS = ("structured", "mean_field")
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class Evaluation:
 
     Attributes:
         policy: its name, or that of the recipe.
-        metrics: name of a metric to its value for each system (systems,); see `agents.evaluation.comparison_tables.METRIC_COLUMNS`.
+        metrics: name of a metric to its value for each system (systems,); see `agents.evaluation.metric_summary.METRIC_COLUMNS`.
         gain_curve: (horizon + 1, systems) gain of log posterior of the truth over the samples [nats]; what a jump of the
             truth takes away is in it.
         inputs: (horizon, systems) inputs that the plant was given, in parts of their scale, NaN after the end of an
@@ -197,7 +190,9 @@ def _evaluate_policy(
     if truth_is_constant:
         gains = metrics.fisher_information_gain(evaluation.inputs, truth, experiment, evaluation.outputs)
         policy_metrics["fisher_gain"] = gains
-        evaluation.estimator_metrics.update(_estimate_with_other_estimators(evaluation, truth, experiment))
+        evaluation.estimator_metrics.update(
+            estimate_with_other_estimators(evaluation.inputs, evaluation.outputs, truth, experiment)
+        )
         if seed == 0:  # whose systems in this branch an oracle may be stored of
             policy_metrics |= metrics.d_efficiency_metrics(evaluation, env_id, options)
     if not record_available():  # what follows is measured by it
@@ -326,42 +321,3 @@ def _last_input_index(experiment: Experiment) -> int:
             "take 'posterior', 'history' or 'privileged'"
         )
     return list(observation_bounds(experiment.model)).index("last_input")
-
-
-def _estimate_with_other_estimators(
-    evaluation: Evaluation, truth: Any, experiment: SimulatedExperiment
-) -> dict[str, dict[str, FloatArray]]:
-    """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
-
-    The auditor fits the plant's own equation, from the prior's mean and from where estimators of it ended: of a wide
-    guess, the prior's mean alone may lead to a minimum far off. The equation of the paper, on a plant whose
-    input goes linearly from one action to the next, takes as an environment does the input at the sample before.
-    """
-    u, y = evaluation.inputs.T, np.swapaxes(evaluation.outputs, 0, 1)
-    plant, interpolation, own_prior, process_noise, sensor_noises = plant_model_of(experiment, truth)
-    rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
-    estimators: dict[str, tuple[Belief, FloatArray]] = {}
-    if plant == difference():
-        estimators = {name: (experiment.prior_for_model(plant, name), u) for name in FACTORISATIONS}
-    else:
-        name = "ode" if plant.is_continuous else "structured"
-        # The environment's own estimator, without the hypotheses that it may weigh.
-        estimators[f"{name}_alone" if experiment.noise_hypotheses != 1 else name] = own_prior, u
-        if set(parameter_names(plant)) == set(parameter_names(difference())):
-            previous_inputs = (
-                u if not experiment.degree else np.where(np.isnan(u), np.nan, np.pad(u, ((0, 0), (1, 0)))[:, :-1])
-            )
-            estimators |= {
-                f"nlarx_{name}": (experiment.prior_for_model(difference(), name), previous_inputs)
-                for name in FACTORISATIONS
-            }
-    estimator_metrics: dict[str, dict[str, FloatArray]] = {}
-    starts: list[FloatArray] = []
-    for name, (prior, inputs) in estimators.items():
-        beliefs = posteriors(inputs, y, prior, rig if prior.model.is_continuous else None)
-        means, covs = (np.array([getattr(b, f"coefficients_{part}") for b in beliefs]) for part in ("mean", "cov"))
-        estimator_metrics[name] = metrics.posterior_metrics(means, covs, truth, prior.model, prior.scales)
-        starts += [means] if prior.model == plant else []
-    fit = maximum_a_posteriori(plant, u, y, own_prior, process_noise, sensor_noises, interpolation, starts)
-    estimator_metrics[AUDITOR] = metrics.posterior_metrics(fit.mean, fit.cov, truth, plant, experiment.scales)
-    return estimator_metrics

@@ -1,26 +1,26 @@
-"""Clocks of a run: the machine's, and one that jumps, for simulated plants."""
+"""Clocks of a run: the machine's monotonic clock, and a clock that jumps, for simulated plants."""
 
 from __future__ import annotations
 
 import time
 from typing import Protocol
 
-#: The operating system wakes a process so late [s]: the rest is waited for awake.
+#: Last part of a wait that is spent awake [s]: the operating system wakes a process late by about this much.
 _BUSY_WAIT = 3e-4
 
-#: No sleep is longer [s], so that a signal is noticed.
+#: Longest sleep [s], so that a signal is noticed.
 _MAX_SLEEP = 0.05
 
 
 class Clock(Protocol):
-    """Seconds from an unknown beginning."""
+    """A time in seconds since an arbitrary origin."""
 
     def now(self) -> float:
         """The time."""
         ...
 
     def wait(self, until: float) -> None:
-        """Return at this time, or at once where it has passed; earlier where a signal came."""
+        """Return at this time, or at once where it has passed, or earlier where a signal came."""
 
 
 class RealClock:
@@ -31,14 +31,14 @@ class RealClock:
         return time.perf_counter()
 
     def wait(self, until: float) -> None:
-        """Sleep, and be awake a little before the time."""
+        """Sleep until shortly before the time, and wait the rest awake."""
         while (remaining := until - time.perf_counter()) > 0:
             if remaining > _BUSY_WAIT:
                 time.sleep(min(remaining - _BUSY_WAIT, _MAX_SLEEP))
 
 
 class JumpingClock:
-    """A clock that jumps to the time that is waited for: a run takes as long as its computations, and none is late."""
+    """A clock that jumps to the end of each wait: a run takes as long as its computations, and no tick is late."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -48,5 +48,5 @@ class JumpingClock:
         return self._now
 
     def wait(self, until: float) -> None:
-        """Jump."""
+        """Jump to the time, if it lies ahead."""
         self._now = max(self._now, until)

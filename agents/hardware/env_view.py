@@ -1,4 +1,4 @@
-"""What a policy sees of a run: the same as of an environment, read off the estimator's belief."""
+"""A run as an environment: observation and belief for a policy, computed from the estimator of the run."""
 
 from __future__ import annotations
 
@@ -17,21 +17,23 @@ from estimator.support.array_types import FloatArray
 
 
 class EnvView:
-    """Stands where a policy expects the unwrapped environment of the rig around its plant.
+    """The object that takes the place of the unwrapped environment ``Rig-v0`` for a policy.
 
     Args:
         rig: of the run.
-        prior: the belief that the run starts from.
-        horizon: of the run.
+        prior: the belief at the start of the run.
+        horizon: number of samples of the run.
 
     Attributes:
-        experiment: that of ``Rig-v0`` around a plant.
-        belief: the belief now; to be set.
-        shown: (1, entries) what `observation` gave last.
+        experiment: the experiment of ``Rig-v0`` around a plant.
+        max_input: largest input, in the belief's scale.
+        horizon: number of samples of the run.
+        belief: the belief now; the run sets it.
+        last_observations: (1, entries) the last result of `observation`.
     """
 
     def __init__(self, rig: Rig, prior: Belief, horizon: int) -> None:
-        # The delay is the estimator's affair: a policy sees the belief that its input will meet.
+        # The estimator takes the delay into account: a policy gets the belief at the time when its input acts.
         self.experiment = RigPlantExperiment(rig=replace(rig, delay=0), prior=prior, horizon=horizon)
         self.max_input, self.horizon = float(self.experiment.max_input), horizon
         self.belief = prior
@@ -39,21 +41,21 @@ class EnvView:
 
     @property
     def unwrapped(self) -> EnvView:
-        """Itself."""
+        """This object."""
         return self
 
     @property
     def records(self) -> FloatArray:
-        """(1, size) the belief now as the flat record of `estimator.Belief`."""
+        """The belief now as the flat record (1, size) of `estimator.Belief`."""
         return self.belief.record[None].copy()
 
     def observation(self, u: float, y: float, elapsed: int) -> npt.NDArray[np.float32]:
-        """The observation (entries,) of `duffing_env.env`, after an input and an output in the belief's scales.
+        """The observation (entries,) of ``Rig-v0``, after an input and an output in the belief's scales.
 
         Args:
             u: the last input.
-            y: the last output; NaN, a missing one, is shown as what the model expects of the sensor.
-            elapsed: samples since the run began.
+            y: the last output; NaN, a missing output, is replaced by the model's prediction.
+            elapsed: samples since the start of the run.
         """
         belief, prior = self.belief, self.experiment.prior_belief
         cov, prior_stds = belief.coefficients_cov, np.sqrt(np.diag(prior.coefficients_cov))

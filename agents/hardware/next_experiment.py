@@ -1,11 +1,11 @@
-"""The next experiment on a rig, as a whole: a signal, and what is to be expected after it."""
+"""Design of the next experiment on a rig: a safe input signal, and the intervals expected after it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -38,62 +38,90 @@ from estimator.support.array_types import FloatArray
 from estimator.support.file_io import write_atomically
 from estimator.support.progress import ProgressCallback, ignore_progress
 
-#: Samples of an experiment, which is planned as a whole.
+#: Largest length of an experiment, which is planned as a whole [samples].
 _MAX_SAMPLES = 2**16
 
-#: Candidates of noise from which the planner climbs: under a wide belief, summits are nats apart. Long signals have
-#: fewer, because each takes long to climb: so many samples in all, and between these numbers.
-_NOISE_START_SAMPLES, _MIN_NOISE_STARTS, _MAX_NOISE_STARTS = 4096, 2, 14
+#: Total length of the noise signals from which the planner starts [samples]: long signals have fewer, because each
+#: takes long to optimise. Under a wide belief, local optima differ by nats.
+_NOISE_START_SAMPLES = 4096
 
-#: Systems on which a policy that answers to outputs is played.
+#: Smallest number of noise signals to start from.
+_MIN_NOISE_STARTS = 2
+
+#: Largest number of noise signals to start from.
+_MAX_NOISE_STARTS = 14
+
+#: Systems on which a policy that responds to outputs is played.
 _N_ROLLOUTS = 4
 
-#: Systems whose outputs are looked at beforehand, and which of their quantiles: a band of 90 %, and its middle.
-_N_PREDICTED_SYSTEMS, _OUTPUT_QUANTILES = 200, (0.05, 0.5, 0.95)
+#: Systems whose outputs are predicted.
+_N_PREDICTED_SYSTEMS = 200
 
-#: Standard deviation of a state at rest, where the planner's plan for the belief's means begins, in parts of its scale.
+#: Quantiles of the predicted outputs: a band of 90 % and the median.
+_OUTPUT_QUANTILES = (0.05, 0.5, 0.95)
+
+#: Standard deviation of a state at rest, from which the plan for the belief's means starts [scale of the state].
 _REST_STD = 1e-3
+
+
+class ParameterForecast(NamedTuple):
+    """A parameter before and after an experiment.
+
+    Attributes:
+        name: of the parameter.
+        mean: before.
+        interval: credible interval before.
+        expected_half_width: half width of the interval that is expected after.
+        unit: of all of them.
+    """
+
+    name: str
+    mean: float
+    interval: tuple[float, float]
+    expected_half_width: float
+    unit: str
 
 
 @dataclass(frozen=True, eq=False)
 class ExperimentDesign:
-    """An experiment to come.
+    """The design of an experiment.
 
     Attributes:
-        rig: it is for.
-        policy: that chose it.
+        rig: of the experiment.
+        policy: name of the policy that chose the inputs.
         u: (T,) inputs in the rig's unit.
-        shown: (3, T) what the sensor is expected to show, in its unit: the 5 %, 50 % and 95 % quantiles over the
-            belief, cut at twice the range.
-        prior: what is believed now.
-        expected_stds: parameter to the standard deviation that is to be expected after it: the median over the belief.
-        information_gain: nats that the coefficients are expected to gain.
-        share: of what the policy chose that is safe.
-        exit_probability: at most that of leaving the range, under the belief (`agents.planning.open_loop.posterior_samples.MonteCarloSystems.chance`).
-        samples_per_period: samples in a period of small motions, as they are believed.
+        output_quantiles: (3, T) 5 %, 50 % and 95 % quantiles of the predicted output over the belief, in the sensor's
+            unit, clipped to twice the range.
+        prior: the belief before the experiment.
+        expected_stds: parameter to its standard deviation expected after the experiment, the median over the belief.
+        information_gain: expected information gain on the coefficients [nats].
+        scale: the factor, from 0 to 1, by which the policy's inputs are multiplied to be safe.
+        exit_probability: upper bound of the probability that the output leaves its range, under the belief
+            (`MonteCarloSystems.violation_probability`).
+        samples_per_period: samples in a period of small motions, under the belief.
     """
 
     rig: Rig
     policy: str
     u: FloatArray
-    shown: FloatArray
+    output_quantiles: FloatArray
     prior: Belief
     expected_stds: Mapping[str, float]
     information_gain: float
-    share: float
+    scale: float
     exit_probability: float
     samples_per_period: float
 
-    def parameter_rows(self, level: float = 0.9) -> list[tuple[str, float, tuple[float, float], float, str]]:
-        """Of each parameter: name, mean, its interval now, the half width of that to be expected, and the unit."""
+    def parameter_rows(self, level: float = 0.9) -> list[ParameterForecast]:
+        """Every parameter with its interval of this level now, and the half width expected after the experiment."""
         normal_quantile, intervals = float(ndtri(0.5 + level / 2)), self.prior.interval(level)
         return [
-            (name, mean, intervals[name], normal_quantile * self.expected_stds[name], unit)
+            ParameterForecast(name, mean, intervals[name], normal_quantile * self.expected_stds[name], unit)
             for name, (mean, _, unit) in self.prior.parameters().items()
         ]
 
     def write(self, path: Path) -> None:
-        """A CSV file with time [s] and the input, as `identify` reads them beside an output."""
+        """Write a CSV file with time [s] and input, in the format that `identify` reads."""
         name = name_with_unit(self.rig.input.column or "u", self.rig.input.unit)
         lines = [f"time [s],{name if unit_in_name(name) else f'{name} [{self.rig.input.unit}]'}"]
         lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
@@ -111,18 +139,19 @@ def design_experiment(
 ) -> ExperimentDesign:
     """Design the next experiment: a signal for an oscillator at rest.
 
-    ``efe`` climbs what is learned of systems drawn from the belief, on average (`agents.planning.open_loop.chance_constrained_block`). A policy that
-    answers to outputs is played on some of them, and the signal that tells most on average is taken. A signal is taken
-    as it is. What would leave the range with more than the bound is made smaller.
+    ``efe`` maximises the expected information over systems that are drawn from the belief
+    (`agents.planning.open_loop.chance_constrained_block`). A policy that responds to outputs is played on some of these
+    systems, and the signal with the largest expected information is taken. A signal is taken as it is. Inputs that
+    would leave the range with a larger probability than the bound are scaled down.
 
     Args:
         rig: with the limit of the input and the range of the output.
-        prior: what is believed, such as ``identify(...).belief``; the rig's guess where it is None.
-        policy: any that `agents.policies.make_policy` knows.
+        prior: the belief before, such as ``identify(...).belief``; None: by the rig's guess.
+        policy: the name of a policy (`agents.policies.make_policy`).
         samples: of the experiment.
-        bound: of the probability that the output leaves its range, under the whole belief.
+        bound: largest probability that the output leaves its range, under the whole belief.
         seed: of the policy, and of the systems that are drawn.
-        on_progress: is told the share that is done (`estimator.support.progress.show_progress`).
+        on_progress: called with the fraction that is done (`estimator.support.progress.show_progress`).
 
     Raises:
         ValueError: for a rig without limit or range, or without guess where there is no prior; a prior in other
@@ -135,8 +164,8 @@ def design_experiment(
         >>> rig = Rig(1e-3, input=Channel("N", limit=20.0, noise=0.02), output=Channel("m", range=0.03, noise=5e-6),
         ...           guess={"m": (0.3, 0.5), "c": (0.1, 2.0), "a": (1e3, 5e3), "b": (0.0, 1e8)})
         >>> found = design_experiment(rig, policy="prbs", samples=256)
-        >>> name, mean, (low, high), half, unit = found.rows()[0]
-        >>> bool(half < (high - low) / 2), unit, found.probability < 0.05, len(found.u)
+        >>> name, mean, (low, high), half, unit = found.parameter_rows()[0]
+        >>> bool(half < (high - low) / 2), unit, found.exit_probability < 0.05, len(found.u)
         (True, 'kg', True, 256)
     """
     check_integer("samples", samples, _MAX_SAMPLES, 8)
@@ -153,68 +182,104 @@ def design_experiment(
     with attribute_user_errors(policy, "policy"):
         policy_object = make_policy(policy, env_view, seed=seed)  # type: ignore[arg-type]
     if isinstance(policy_object, EfePlanner):
-        n_noise_starts = min(max(_NOISE_START_SAMPLES // int(samples), _MIN_NOISE_STARTS), _MAX_NOISE_STARTS)
-        starting_inputs = initial_guesses(
-            policy_object.settings, _belief_record_at_rest(belief), int(samples), seed, n_noise_starts
-        )
-        u, scale, probability = optimise_block(
-            view, systems, futures, starting_inputs, env_view.max_input, bound, tell=on_progress
-        )
+        block = _optimised_block(policy_object, env_view, view, systems, futures, bound, seed, on_progress)
     elif isinstance(policy_object, SignalPolicy):
-        u, scale, probability = SignalBlockDesigner(policy_object, env_view).block(int(samples), futures, bound)
+        block = SignalBlockDesigner(policy_object, env_view).design_block(int(samples), futures, bound)
     else:
-        rollouts = [
-            _roll_out_policy(
-                policy, env_view, futures, k, bound, seed, lambda part, k=k: on_progress((k + part) / _N_ROLLOUTS)
-            )
-            for k in range(_N_ROLLOUTS)
-        ]
-        information = [expected_information(view, systems, limit, u)[0] for u, *_ in rollouts]
-        u, scale, probability = rollouts[int(np.argmax(information))]
+        block = _best_rollout(policy, env_view, view, systems, futures, bound, seed, on_progress)
     samples_per_period = 1 / believed_resonance(belief)
-    if scale == 0.0 and probability >= bound:
+    is_undersampled = samples_per_period < MIN_SAMPLES_PER_PERIOD
+    if block.scale == 0.0 and block.exit_probability >= bound:
         raise ValueError(
-            undersampling_message(rig.step, samples_per_period) if samples_per_period < MIN_SAMPLES_PER_PERIOD else
-            f"rig must be known well enough to stay in its range, but even without input it leaves it with probability "
-            f"{probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a wider range"
-        )  # fmt: skip
-    u = np.clip(u, -env_view.max_input, env_view.max_input)
+            undersampling_message(rig.step, samples_per_period)
+            if is_undersampled
+            else "rig must be known well enough to stay in its range, but even without input it leaves it with "
+            f"probability {block.exit_probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a "
+            "wider range"
+        )
+    u = np.clip(block.inputs, -env_view.max_input, env_view.max_input)
     log_det_gain, covs = expected_information(view, systems, limit, u)
     if not (np.isfinite(log_det_gain) and np.isfinite(covs).all()):
         raise ValueError(
-            undersampling_message(rig.step, samples_per_period) if samples_per_period < MIN_SAMPLES_PER_PERIOD else
-            "rig must be known well enough for its motion to be followed, but some systems that its guess allows run "
-            f"away between two samples; give a narrower guess or a shorter step than {rig.step!r} s"
-        )  # fmt: skip
-    gain = log_det_gain + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1])
-    expected_stds = _expected_stds(belief, systems, covs)
-    outputs = futures.simulate_outputs(u, slice(_N_PREDICTED_SYSTEMS))
-    outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
-    output_quantiles = belief.scales.output * np.quantile(outputs, _OUTPUT_QUANTILES, axis=0)
+            undersampling_message(rig.step, samples_per_period)
+            if is_undersampled
+            else "rig must be known well enough for its motion to be followed, but some systems that its guess allows "
+            f"run away between two samples; give a narrower guess or a shorter step than {rig.step!r} s"
+        )
     return ExperimentDesign(
         rig,
         policy,
         u * belief.scales.input,
-        output_quantiles,
+        _predicted_output_quantiles(belief, futures, limit, u),
         belief,
-        expected_stds,
-        gain,
-        scale,
-        probability,
+        _expected_stds(belief, systems, covs),
+        log_det_gain + 0.5 * float(np.linalg.slogdet(belief.coefficients_cov)[1]),
+        block.scale,
+        block.exit_probability,
         samples_per_period,
     )
 
 
+def _optimised_block(
+    planner: EfePlanner,
+    env_view: EnvView,
+    view: ModelView,
+    systems: SampledSystems,
+    futures: MonteCarloSystems,
+    bound: float,
+    seed: int,
+    on_progress: ProgressCallback,
+) -> ScaledBlock:
+    """The planner's block, optimised from noise signals and from the plan for the belief's means."""
+    samples = env_view.horizon
+    n_noise_starts = min(max(_NOISE_START_SAMPLES // samples, _MIN_NOISE_STARTS), _MAX_NOISE_STARTS)
+    record = _belief_record_at_rest(env_view.belief)
+    starting_inputs = initial_guesses(planner.settings, record, samples, seed, n_noise_starts)
+    return ScaledBlock(
+        *optimise_block(view, systems, futures, starting_inputs, env_view.max_input, bound, tell=on_progress)
+    )
+
+
+def _best_rollout(
+    policy: str,
+    env_view: EnvView,
+    view: ModelView,
+    systems: SampledSystems,
+    futures: MonteCarloSystems,
+    bound: float,
+    seed: int,
+    on_progress: ProgressCallback,
+) -> ScaledBlock:
+    """The inputs of a policy on some of the drawn systems, of which those with the most expected information."""
+    rollouts = [
+        _roll_out_policy(
+            policy, env_view, futures, k, bound, seed, lambda part, k=k: on_progress((k + part) / _N_ROLLOUTS)
+        )
+        for k in range(_N_ROLLOUTS)
+    ]
+    limit = float(env_view.experiment.max_output)
+    information = [expected_information(view, systems, limit, block.inputs)[0] for block in rollouts]
+    return rollouts[int(np.argmax(information))]
+
+
+def _predicted_output_quantiles(belief: Belief, futures: MonteCarloSystems, limit: float, u: FloatArray) -> FloatArray:
+    """Quantiles (3, T) of the output that is predicted for inputs, in the sensor's unit."""
+    outputs = futures.simulate_outputs(u, slice(_N_PREDICTED_SYSTEMS))
+    outputs = np.clip(np.nan_to_num(outputs, nan=2 * limit), -2 * limit, 2 * limit)  # a system may run away
+    quantiles: FloatArray = belief.scales.output * np.quantile(outputs, _OUTPUT_QUANTILES, axis=0)
+    return quantiles
+
+
 def undersampling_message(step: float, samples_per_period: float) -> str:
-    """What to say of a step [s] at which there are so many samples in a period."""
+    """The message for a sampling step [s] at which a period has too few samples."""
     return (
-        f"step must be at most 1/{MIN_SAMPLES_PER_PERIOD:g} of a period, but is {step:g} s: as believed now, there are "
+        f"step must be at most 1/{MIN_SAMPLES_PER_PERIOD:g} of a period, but is {step:g} s: the belief has "
         f"{samples_per_period:.1f} samples in a period; sample faster, {RECOMMENDED_SAMPLES_PER_PERIOD} at least"
     )
 
 
 def _expected_stds(belief: Belief, systems: SampledSystems, covs: FloatArray) -> dict[str, float]:
-    """Parameter to the median over systems of its standard deviation with these covariances."""
+    """Parameter to its standard deviation under these covariances, the median over systems."""
     parameter_covs = [
         propagate_to_physical(belief.model, c, cov, belief.scales)[1]
         for c, cov in zip(systems.coefficients, covs, strict=True)
@@ -224,7 +289,7 @@ def _expected_stds(belief: Belief, systems: SampledSystems, covs: FloatArray) ->
 
 
 def _belief_record_at_rest(belief: Belief) -> FloatArray:
-    """A belief's record, with the state at rest."""
+    """The record of a belief with its state at rest."""
     n, places, record = belief.model.n_states, covariance_indices(belief.model), belief.record.copy()
     record[:n] = 0.0
     record[0] = equilibria(belief.model, belief.coefficients_mean)[0]
@@ -263,7 +328,7 @@ def _roll_out_policy(
     seed: int,
     on_progress: ProgressCallback,
 ) -> ScaledBlock:
-    """What a policy answers to a drawn system, as large as it is safe on all."""
+    """The inputs of a policy on a drawn system, scaled down until they are safe on all systems."""
     import gymnasium as gym
 
     import duffing_env  # noqa: F401  registers the tracks
@@ -286,4 +351,4 @@ def _roll_out_policy(
         if terminated or truncated:
             break
     scale, probability = futures.safe_scale(u, bound)
-    return scale * u, scale, probability
+    return ScaledBlock(scale * u, scale, probability)

@@ -1,4 +1,4 @@
-"""The plant of a run: what is between a rig and the program. Any object with these methods."""
+"""The hardware interface of a rig: the methods that a run calls to apply inputs and read outputs."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from estimator.support.array_types import FloatArray
 
 
 class HardwarePlant(Protocol):
-    """A plant, in the rig's units. It begins disarmed, its input at zero; any exception ends the run.
+    """A plant, in the rig's units. It begins disarmed, with its input at zero; any exception ends the run.
 
-    A method that is never called need not work: a plant for runs by samples needs no `play`, one for runs by blocks
-    neither `apply` nor `read`.
+    A method that is never called need not work: a run by samples calls no `play`, a run by blocks neither `apply` nor
+    `read`.
 
     Attributes:
-        has_watchdog: whether it zeroes its input by itself when it has heard nothing for the time that `arm` was told.
+        has_watchdog: whether the plant zeroes its input by itself after the silence [s] that `arm` was given.
     """
 
     has_watchdog: bool
 
     def arm(self, watchdog: float | None) -> object:
-        """Let inputs through from now on; zero by itself after ``watchdog`` seconds of silence, if it watches."""
+        """Let inputs through from now on; a plant with a watchdog zeroes its input after ``watchdog`` s of silence."""
 
     def apply(self, u: float) -> float:
-        """Apply an input now, until the next; returns what is applied in truth, after clamps of the plant's own."""
+        """Apply an input from now until the next one; returns the input after the plant's own clamps."""
         ...
 
     def read(self) -> float:
-        """The output now. A value that is not new is an exception, or NaN: never an old value without a word."""
+        """The output now. Where there is no new value, raise or return NaN: never return an old value."""
         ...
 
     def play(self, u: FloatArray) -> tuple[npt.ArrayLike, npt.ArrayLike]:
-        """Play inputs (N,), one a sampling step, then zero.
+        """Play inputs (N,), one per sampling step, then zero.
 
         Returns:
             Inputs (N,) as they were applied, and outputs (N,): the k-th at the moment when the k-th input began.
@@ -54,18 +54,18 @@ _PLANT_METHODS = ("arm", "apply", "read", "play", "zero", "disarm")
 
 
 def load_plant(factory_path: str, rig: Rig, settings: Mapping[str, Any] | None = None) -> HardwarePlant:
-    """The plant that ``factory(rig, **settings)`` makes, where ``factory_path`` is ``module:factory``.
+    """Make a plant by ``factory(rig, **settings)``, where ``factory_path`` is ``module:factory``.
 
-    A module in the working directory is found, too.
+    Modules in the working directory are found, too.
 
     Args:
         factory_path: such as ``lab:plant``.
-        rig: handed to the factory.
+        rig: passed to the factory.
         settings: the table ``[instrument]`` of the rig file.
 
     Raises:
-        ValueError: naming what is wrong: no such module or factory, one that fails, or no plant.
-        ModuleNotFoundError: for a package that the factory needs, and that is not there.
+        ValueError: for a module or factory that does not exist, a factory that fails, or a result that is no plant.
+        ModuleNotFoundError: for a package that the factory needs and that is not installed.
     """
     factory = load_object(factory_path, "plant")
     try:
@@ -74,22 +74,21 @@ def load_plant(factory_path: str, rig: Rig, settings: Mapping[str, Any] | None =
         raise
     except (Exception, SystemExit) as error:
         raise ValueError(
-            f"plant must be made by {factory_path}(rig, **instrument), with the table [instrument] of the rig file, but that "
-            f"failed: {type(error).__name__}: {error}"
+            f"plant must be made by {factory_path}(rig, **instrument), with the table [instrument] of the rig file, "
+            f"but that failed: {type(error).__name__}: {error}"
         ) from error
     return check_plant(plant)
 
 
 def check_plant(plant: Any) -> HardwarePlant:
-    """The plant, if it is one.
+    """The plant, if it has all attributes of `HardwarePlant`.
 
     Raises:
-        ValueError: naming the methods that are missing.
+        ValueError: naming the attributes that are missing.
     """
-    missing = [name for name in (*_PLANT_METHODS, "watches") if not hasattr(plant, name)]
+    required = [*_PLANT_METHODS, "has_watchdog"]
+    missing = [name for name in required if not hasattr(plant, name)]
     if missing:
-        raise ValueError(
-            f"plant must have {[*_PLANT_METHODS, 'watches']}, but {plant!r:.60} has no {missing}; add them"
-        )
+        raise ValueError(f"plant must have {required}, but {plant!r:.60} has no {missing}; add them")
     checked: HardwarePlant = plant
     return checked

@@ -1,4 +1,4 @@
-"""What a run writes, as it happens: a manifest, a row for every sample, a line for every event."""
+"""The files of a run, written as it happens: a manifest, a row for each sample, and a line for each event."""
 
 from __future__ import annotations
 
@@ -9,38 +9,67 @@ import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, Protocol
 
-from agents.console_output import check_output_folder, package_versions, replace_non_finite
+from agents.output_paths import check_output_folder
+from agents.result_files import package_versions, replace_non_finite
 from estimator.identification.data.column_names import name_with_unit
 from estimator.rigs.rig import Rig
 from estimator.support.file_io import append_atomically, explain_write_errors, lock_folder, write_atomically
 
-#: Columns of samples.csv. `identify` takes ``time``, ``u`` and ``y``, which are called as the rig calls its columns.
-#: ``time`` is that of the tick, ``clock`` the one when the row was complete; ``u`` the mean of the applied input until
-#: the next tick, ``asked`` what was asked for; ``untimely`` an output that came too late to be used.
-SAMPLE_COLUMNS = ("sample", "time", "u", "y", "asked", "block", "late", "clock", "untimely")
+
+class SampleRow(NamedTuple):
+    """A row of samples.csv; None and NaN are written as nothing. `identify` reads ``time``, ``u`` and ``y``.
+
+    Attributes:
+        sample: number of the tick.
+        time: of the tick [s].
+        u: mean of the applied input until the next tick; its column has the name that the rig gives it.
+        y: output at the tick; its column has the name that the rig gives it.
+        commanded: the input that the policy chose, before clamps.
+        block: number of the block; 0 in a run by samples.
+        late: 1 where the tick was missed, or its output or input was late, else 0.
+        clock: time when the row was complete [s].
+        late_output: an output that came too late to be used.
+    """
+
+    sample: int
+    time: float
+    u: float | None
+    y: float | None
+    commanded: float | None
+    block: int
+    late: int
+    clock: float
+    late_output: float | None = None
+
+
+class EventLog(Protocol):
+    """Writes an event of a run."""
+
+    def __call__(self, event: str, **details: object) -> None:
+        """Write the event's name and its details."""
 
 
 class Recording:
     """The folder of a run.
 
-    - ``manifest.json``: what was to be done, with what; at the end also how it ended.
-    - ``samples.csv``: a row for every sample, handed to the operating system before the next one: after a kill -9 at
-      most the last is missing. A row without input and output is a pause of unknown length.
-    - ``events.jsonl``: armed, disarmed, late samples, designs of blocks, what ended the run.
+    - ``manifest.json``: command, rig, settings and plant of the run; at the end also how it ended.
+    - ``samples.csv``: a row for each sample (`SampleRow`), handed to the operating system before the next one: after a
+      kill -9 at most the last is missing. A row without input and output is a pause of unknown length.
+    - ``events.jsonl``: armed, disarmed, late samples, designs of blocks, and the end of the run.
 
     Args:
-        folder: is made; must be empty.
-        manifest: what is to be kept about the run.
-        rig: whose names of columns the samples have.
+        folder: a new folder, or an empty one.
+        manifest: entries of manifest.json.
+        rig: names the columns of input and output.
 
     Raises:
-        ValueError: for a folder that holds something, or that another process writes to.
-        NotADirectoryError: for a file, or a place in one.
+        ValueError: for a folder that is not empty, or that another process writes to.
+        NotADirectoryError: for a file, or a path in a file.
     """
 
-    def __init__(self, folder: str | Path, manifest: dict[str, Any], rig: Rig) -> None:
+    def __init__(self, folder: str | Path, manifest: dict[str, object], rig: Rig) -> None:
         self.folder = Path(folder)
         check_output_folder("out", self.folder)
         with explain_write_errors(self.folder):
@@ -52,10 +81,10 @@ class Recording:
             self._release_lock()
             raise
 
-    def _create_files(self, manifest: dict[str, Any], rig: Rig) -> None:
+    def _create_files(self, manifest: dict[str, object], rig: Rig) -> None:
         if any(self.folder.iterdir()):
             raise ValueError(f"out must be a new or empty folder, but {self.folder} holds something; name another one")
-        self._manifest = {
+        self._manifest: dict[str, object] = {
             **manifest,
             "versions": package_versions(),
             "commit": _git_commit(),
@@ -64,32 +93,39 @@ class Recording:
         }
         self._write_manifest()
         names = {n: name_with_unit(one.column or n, one.unit) for n, one in (("u", rig.input), ("y", rig.output))}
-        append_atomically(self.samples, ",".join(names.get(name, name) for name in SAMPLE_COLUMNS) + "\n")
+        append_atomically(self.samples_path, ",".join(names.get(name, name) for name in SampleRow._fields) + "\n")
 
     @property
-    def samples(self) -> Path:
-        """The file of the samples."""
+    def samples_path(self) -> Path:
+        """The path of samples.csv."""
         return self.folder / "samples.csv"
 
-    def write_rows(self, rows: Sequence[Sequence[float | int | None]]) -> None:
-        """Write rows, with a value or None for each of `SAMPLE_COLUMNS`."""
+    def write_rows(self, rows: Sequence[SampleRow]) -> None:
+        """Append rows to samples.csv."""
         lines = [
             ",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows
         ]
-        append_atomically(self.samples, "\n".join(lines) + "\n")
+        append_atomically(self.samples_path, "\n".join(lines) + "\n")
 
-    def log_event(self, event: str, **details: Any) -> None:
-        """Write a line about an event."""
+    def log_event(self, event: str, **details: object) -> None:
+        """Append an event to events.jsonl (`EventLog`)."""
         line = json.dumps(replace_non_finite({"time": _utc_timestamp(), "event": event, **details}))
         append_atomically(self.folder / "events.jsonl", line + "\n")
 
-    def close(self, **outcome: Any) -> None:
-        """Tell events and manifest how it ended; the samples become read-only."""
+    def close(self, *, how: str, message: str, late: int) -> None:
+        """Write into events and manifest how the run ended; samples.csv becomes read-only.
+
+        Args:
+            how: outcome of the run.
+            message: the reason, and warnings.
+            late: number of late ticks.
+        """
+        outcome = {"how": how, "message": message, "late": late}
         try:
             self.log_event("ended", **outcome)
             self._manifest |= {**outcome, "ended": _utc_timestamp()}
             self._write_manifest()
-            self.samples.chmod(0o444)
+            self.samples_path.chmod(0o444)
         finally:
             self._release_lock()
 
@@ -107,7 +143,7 @@ def _utc_timestamp() -> str:
 
 
 def _git_commit() -> str | None:
-    """Of the repository that the program lies in, if it does."""
+    """The commit of the repository that this file lies in; None where there is none."""
     repository = Path(__file__).parents[2]
     if not (repository / ".git").exists():
         return None

@@ -1,11 +1,11 @@
-"""The estimator of a run: told what was applied, and asked for the belief that the next input meets."""
+"""The estimator of a run: the belief from applied inputs and outputs, predicted to when the next input acts."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,19 +23,38 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import reset_state, rig_prior
 from estimator.support.array_types import FloatArray
 
-#: A pause is of an unknown length up to so many periods, and never more samples.
-_MAX_PAUSE_PERIODS, _MAX_PAUSE_SAMPLES = 2.0, 4_000
+#: Longest pause between two blocks, whose length is unknown [periods of small motions].
+_MAX_PAUSE_PERIODS = 2.0
 
-#: Where a system may be after a pause is taken apart into so many Gaussians, each wider by this part of the variance.
-_N_COMPONENTS, _COMPONENT_INFLATION = 16, 0.01
+#: The same [samples].
+_MAX_PAUSE_SAMPLES = 4_000
 
-#: What is so far out, in parts of the output's range, has run away.
+#: Gaussians in the mixture of the states after a pause.
+_N_COMPONENTS = 16
+
+#: Variance that is added to each of these Gaussians, as a fraction of the mixture's variance.
+_COMPONENT_INFLATION = 0.01
+
+#: Output beyond which a system has run away [ranges of the output].
 _DIVERGED_OUTPUT = 3.0
 
 
+class _GaussianComponent(NamedTuple):
+    """A component of a mixture: logarithm of its weight, mean (n,) and covariance (n, n)."""
+
+    log_weight: float
+    mean: FloatArray
+    cov: FloatArray
+
+
+class _FreeResponse(Protocol):
+    def __call__(self, systems: FloatArray, u: float, lengths: npt.NDArray[np.int64]) -> object:
+        """Let systems (N, d), states before coefficients, respond to one sample of u and then ``lengths`` of zero."""
+
+
 @cache
-def _compile_free_response(model: Model) -> Any:
-    """``free_response(systems, u, lengths)``: states in rows, behind them coefficients, after a sample with u and pauses."""
+def _compile_free_response(model: Model) -> _FreeResponse:
+    """The compiled free response of a model."""
     kernels = compile_noise_free_response(model)
     layout, step, n = kernels.layout, kernels.step, model.n_states
     size, n_variables, input_index = len(layout), len(model.names), layout["INPUT"]
@@ -52,18 +71,19 @@ def _compile_free_response(model: Model) -> Any:
                 step(W)
             copy_numbers(systems[i], 0, W, n)
 
-    return free_response
+    compiled: _FreeResponse = free_response
+    return compiled
 
 
-def _fit_gaussian_mixture(states: FloatArray) -> list[tuple[float, FloatArray, FloatArray]]:
-    """A mixture of Gaussians for states (N, n): logarithm of the weight, mean and covariance of each."""
+def _fit_gaussian_mixture(states: FloatArray) -> list[_GaussianComponent]:
+    """A mixture of Gaussians for states (N, n), by k-means."""
     from scipy.cluster.vq import kmeans2
 
     stds = states.std(axis=0)
     labels = kmeans2(states / stds, _N_COMPONENTS, seed=0, minit="++")[1]
     clusters = [states[labels == k] for k in range(_N_COMPONENTS)]
     return [
-        (
+        _GaussianComponent(
             float(np.log(len(cluster) / len(states))),
             cluster.mean(axis=0),
             np.cov(cluster.T) + _COMPONENT_INFLATION * np.diag(stds**2),
@@ -74,15 +94,15 @@ def _fit_gaussian_mixture(states: FloatArray) -> list[tuple[float, FloatArray, F
 
 
 class RunEstimator:
-    """Follows a run. Sample k of a run is the output at a tick and the input that is applied from that tick on.
+    """The online estimator of a run. Sample k is the output at a tick and the input that is applied from this tick on.
 
     Args:
-        rig: with a guess, where there is no prior.
-        prior: what is believed before the run, such as the ``belief`` of `online.identify`; the guess where None.
-            Nobody knows what the rig did since: its state does not count.
+        rig: with a guess where there is no prior.
+        prior: the belief before the run, such as ``identify(...).belief``; None: by the rig's guess. Its state is
+            reset, because the rig has moved since.
 
     Raises:
-        ValueError: for a rig with neither guess nor prior, or whose input is not held, or comes early.
+        ValueError: for a rig with neither guess nor prior, with an input that is not held, or with a negative delay.
     """
 
     def __init__(self, rig: Rig, prior: Belief | None = None) -> None:
@@ -96,11 +116,11 @@ class RunEstimator:
             raise ValueError(
                 "rig must have a guess of m, c, a and b for a run, but has none; add one, or go on from a posterior"
             )
-        # What came before an output is given with it: so the belief is that of the tick, before the next input.
+        # Each output is given with the input before it: so the belief is of the tick, before the next input.
         self.delay, causal_rig = rig.integer_delay, replace(rig, delay=rig.integer_delay - 1)
         prior = rig_prior(rig) if prior is None else reset_state(prior)
         self._n_pauses = 0
-        self._start_components: list[tuple[float, FloatArray, FloatArray]] = []
+        self._start_components: list[_GaussianComponent] = []
         self._systems_after_pause: SystemDraws | None = None
         self._rig, self._prior = rig, prior
         self._blocks: list[tuple[FloatArray, FloatArray]] = []
@@ -110,11 +130,13 @@ class RunEstimator:
 
     @property
     def belief(self) -> Belief:
-        """At the last tick."""
+        """The belief at the last tick."""
         return self.online.belief
 
     def update(self, u: npt.ArrayLike, y: npt.ArrayLike) -> None:
-        """Take outputs (N,) at ticks, NaN where one is missing, each with the input of the tick before it.
+        """Update by outputs (N,) at ticks, NaN where one is missing, each with the input of the tick before it.
+
+        After a pause the estimator starts from each Gaussian of the mixture; the one with the best evidence is kept.
 
         Raises:
             ValueError: where the belief overflows; it is then as before.
@@ -125,7 +147,7 @@ class RunEstimator:
             self._set_state(mean, cov)
             try:
                 evidence = log_weight - self.online.run(u, y, missing=True)[:, -1].sum()
-            except ValueError:  # as far from the truth as that
+            except ValueError:  # the belief overflows: this component is far from the truth
                 evidence = -np.inf
             if evidence > best_evidence:
                 best, best_evidence = self.online.arrays(), evidence
@@ -136,72 +158,66 @@ class RunEstimator:
             self.online.restore(best)
 
     def update_block(self, u: FloatArray, y: FloatArray) -> None:
-        """Take a block: outputs (N,) at its ticks, NaN where one is missing, each with the input applied from it on.
+        """Update by a block: outputs (N,) at its ticks, NaN where one is missing, and the inputs applied from them on.
 
-        The coefficients are then what all blocks tell together. The first, a silent one, tells nothing of them.
+        The coefficients are fitted to all blocks together, but not to the first one, which is silent.
 
         Raises:
             ValueError: where the belief overflows; it is then as before.
         """
-        initial_arrays, components, previous_inputs = (
-            self.online.arrays(),
-            self._start_components,
-            np.concatenate([[0.0], u[:-1]]),
-        )
+        initial_arrays, components = self.online.arrays(), self._start_components
+        previous_inputs = np.concatenate([[0.0], u[:-1]])
         self.update(previous_inputs, y)
         self._blocks.append((u, y))
         if len(self._blocks) == 1:
             return
-        coefficients, first_pass = (
-            refit_coefficients(self._rig, self._blocks, self._prior, self.belief),
-            self.online.arrays(),
-        )
-        # Where the rig is now is what the block tells of a rig with these coefficients.
+        coefficients = refit_coefficients(self._rig, self._blocks, self._prior, self.belief)
+        first_pass = self.online.arrays()
+        # The state now is estimated once more, by the same block, with these coefficients.
         self.online.restore(initial_arrays)
         self._start_components = components
         self._set_coefficients(*coefficients)
         try:
             self.update(previous_inputs, y)
-        except ValueError:  # it overflows with these: the state stays that of the first time
+        except ValueError:  # the belief overflows with these: the state of the first pass stays
             self.online.restore(first_pass)
         self._set_coefficients(*coefficients)
 
     def compile_block_update(self) -> None:
-        """Compile what `update_block` calls."""
+        """Compile the functions that `update_block` calls."""
         refit_coefficients(self._rig, [(np.zeros(8), np.zeros(8))] * 2, self._prior, self.belief)
 
     def draw_systems(self, rng: np.random.Generator) -> SystemDraws:
-        """States and coefficients (draws, d) and noises (draws, 2) of systems that are believed in now.
+        """Draw systems from the belief: states and coefficients (draws, d), and noises (draws, 2).
 
-        After a pause they are those that rang: a Gaussian of their states would put many out of the range.
+        After a pause these are the systems whose free response was computed: a Gaussian of their states would put many
+        out of the range.
         """
         return self._systems_after_pause or draw_from_estimator(self.online, rng)
 
     def predict_ahead(self, u: float) -> Belief:
-        """When the next input begins to act, if the one in force is u; nothing changes."""
-        copied = copy.copy(self.online)  # `run` leaves what it shares as it is
+        """The belief when the next input begins to act, if the present input is u; the estimator does not change."""
+        copied = copy.copy(self.online)  # `run` changes no array that the copy shares
         inputs = np.zeros(1 + self.delay)
         inputs[0] = u
         copied.run(inputs, np.full(len(inputs), np.nan), missing=True)
         return copied.belief
 
     def start_pause(self, u: float) -> None:
-        """A pause of unknown length without input begins, after a last sample with u. What is known of the state fades.
+        """Begin a pause of unknown length without input, after a last sample with u.
 
-        The state becomes what it may be after any of the lengths; coefficients and noises stay as they are.
+        The belief about the state becomes a mixture over the lengths; coefficients and noises stay as they are.
 
         Raises:
-            ValueError: where most of what is believed runs away by itself.
+            ValueError: where most of the systems that are drawn from the belief run away without input.
         """
         rng = np.random.default_rng(self._n_pauses)
         self._n_pauses += 1
         systems, noises = draw_from_estimator(self.online, rng)
         systems = np.ascontiguousarray(systems)
-        n, max_pause = (
-            self.online.model.n_states,
-            int(np.clip(_MAX_PAUSE_PERIODS / believed_resonance(self.belief), 8, _MAX_PAUSE_SAMPLES)),
-        )
-        # Each rings by itself: of two wells, a linear forecast would not know that they hold.
+        n = self.online.model.n_states
+        max_pause = int(np.clip(_MAX_PAUSE_PERIODS / believed_resonance(self.belief), 8, _MAX_PAUSE_SAMPLES))
+        # Each system responds by its own equation: a linear prediction would leave the two wells.
         _compile_free_response(self.online.model)(
             systems, u / self.online.scales.input, rng.integers(max_pause, size=len(systems))
         )
@@ -210,8 +226,8 @@ class RunEstimator:
         kept = states[(np.abs(outputs) < _DIVERGED_OUTPUT) & np.isfinite(states).all(axis=1)]
         if len(kept) < len(states) / 2:
             raise ValueError(
-                "rig must be known well enough to stay in its range between blocks, but most of what is believed runs "
-                "away; give a narrower guess, or run sample by sample"
+                "rig must be known well enough to stay in its range between blocks, but most systems that are drawn "
+                "from the belief run away; give a narrower guess, or run sample by sample"
             )
         self.online.rewind()
         self._set_state(kept.mean(axis=0), np.cov(kept.T))

@@ -1,28 +1,28 @@
-"""What a run is to do: the settings of ``duffing-env run``."""
+"""Settings of a run on hardware: policy, number of samples, safety bound and watchdog (``duffing-env run``)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-#: Shortest time of silence that the watchdog is told [s].
+#: Shortest silence after which the watchdog acts, where none is given [s].
 _MIN_WATCHDOG_TIMEOUT = 2.0
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a run is to do.
+    """Settings of a run.
 
     Attributes:
-        policy: efe, the planner, or the name of a signal; without a block also that of any other policy.
+        policy: efe (the planner) or the name of a signal; without a block, the name of any policy.
         samples: number of inputs to play, in all.
-        block: number of inputs that are chosen and played at once; where None, each input is chosen by itself, against
-            the clock.
-        bound: largest probability that a block, or a whole signal, may have of taking the output out of its range.
-        listen: number of samples without input at the start, which tell where the rig stands.
-        watchdog: seconds of silence after which the plant zeroes its input; where None, 2 s, or 20 sampling steps if
-            that is longer, and twice the length of a block besides.
+        block: number of inputs that are chosen and played at once; None: each input is chosen by itself, against the
+            clock.
+        bound: largest probability with which a block, or a whole signal, may take the output out of its range.
+        listen: number of samples without input at the start, from which the rig's state is estimated.
+        watchdog: seconds of silence after which the plant zeroes its input; None: 2 s or 20 sampling steps, whichever
+            is longer, plus twice the length of a block.
         no_watchdog: whether to run a plant that has no watchdog.
-        stale: number of outputs in a row that are missing, late, or the same number again, which end the run; 0: never.
+        stale: number of outputs in a row, missing, late or equal to the one before, that ends the run; 0: no number.
         seed: seed of the policy, and of the systems that are drawn from the belief.
 
     Raises:
@@ -40,7 +40,7 @@ class RunSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # The usual plan is made for --help too, where nothing is imported that computes.
+        # The defaults are made for --help too, which imports nothing that computes.
         if any(getattr(self, field.name) is not field.default for field in fields(self)):
             self._check()
 
@@ -70,7 +70,7 @@ class RunSettings:
         check_bool("no_watchdog", self.no_watchdog)
 
     def watchdog_timeout(self, sampling_step: float) -> float | None:
-        """Seconds that the watchdog is told; None for none."""
+        """Seconds of silence after which the watchdog acts; None where there is no watchdog."""
         if self.no_watchdog:
             return None
         return self.watchdog or max(_MIN_WATCHDOG_TIMEOUT, 20 * sampling_step) + 2 * (self.block or 0) * sampling_step

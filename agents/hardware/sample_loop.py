@@ -1,4 +1,4 @@
-"""A run sample by sample: the clock ticks, and what was decided in time is applied at the tick."""
+"""A run sample by sample: at each tick of the clock, the output is read and the chosen input is applied."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 
 from agents.hardware.clock import Clock
 from agents.hardware.env_view import EnvView
-from agents.hardware.recording import Recording
+from agents.hardware.recording import Recording, SampleRow
 from agents.hardware.run_estimator import RunEstimator
-from agents.hardware.safety_session import SafetyStop, Session
+from agents.hardware.safety_session import SafetyStop, Session, StopReason
 from agents.policies import Policy
 from estimator.support.array_types import FloatArray
 
-#: A tick that is met later than this, in parts of the sampling step, is missed.
+#: Largest delay after which a tick is not yet missed [sampling steps].
 MAX_TICK_DELAY = 0.1
 
-#: More lost outputs than this, in parts of all, are worth a warning.
+#: Largest fraction of lost outputs without a warning.
 _MAX_LOST_FRACTION = 0.02
 
 _LATE_REMEDY = "play blocks (--block 64), or take a longer step"
 
 
-#: ``next_input(k, u, y)``: the input of tick k, in the rig's unit, after an input u in force and the output y.
+#: ``next_input(k, u, y)``: the input of tick k [rig's unit], given the present input u and the last output y.
 InputFunction = Callable[[int, float, float], float]
 
 
 def inputs_from_policy(policy: Policy, env_view: EnvView, run_estimator: RunEstimator) -> InputFunction:
-    """Asks a policy, which sees the belief that its input will meet, one tick ahead."""
+    """Inputs that a policy chooses one tick ahead, from the belief at the time when the input will act."""
     state: Any = None
 
     def next_input(k: int, u: float, y: float) -> float:
@@ -45,22 +45,22 @@ def inputs_from_policy(policy: Policy, env_view: EnvView, run_estimator: RunEsti
 
 
 def inputs_from_signal(inputs: FloatArray) -> InputFunction:
-    """Plays inputs (T,) that were designed before, in the rig's unit."""
+    """Inputs (T,) of a signal that was designed before the run, in the rig's unit."""
     return lambda k, u, y: float(inputs[k])
 
 
 class SampleLoop:
-    """Takes the samples of a run.
+    """The loop of a run by samples.
 
-    At a tick the output is read, and the input that was decided before is applied at once. In the time until the next
-    tick the estimator is told, and the next input decided. A tick that passes meanwhile is missed: the input stays, the
-    output is not read, the row is marked late, and the estimator is told just that. An output that came late is kept
-    beside the others, and not used. Where an input came to act late, its sample has the mean of what was applied.
+    At a tick the output is read, and the input that was chosen before is applied at once. Until the next tick the
+    estimator is updated, and the next input is chosen. A tick that passes meanwhile is missed: the input stays, no
+    output is read, the row is marked late, and the estimator is updated by a missing output. A late output is recorded
+    in a column of its own, and not used. Where an input acted late, its sample has the mean of the applied input.
 
     Attributes:
-        tick: the next one.
-        late: ticks that were missed, or whose output or input was late.
-        lost: outputs that came too late, or that nobody was there to read.
+        tick: number of the next tick.
+        late_ticks: number of ticks that were missed, or whose output or input was late.
+        lost_outputs: number of outputs that came too late, or were not read.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class SampleLoop:
         self._session, self._run_estimator, self._recording = session, run_estimator, recording
         self._clock, self._step = clock, step
         self._start_time = clock.now()
-        self.tick = self.late = self.lost = 0
+        self.tick = self.late_ticks = self.lost_outputs = 0
         self._consecutive_lost = 0
         self._call_durations = 0.0, 0.0
         self._applied_input = self._last_mean_input = 0.0
@@ -79,7 +79,7 @@ class SampleLoop:
         """Take samples without input; the plant may be disarmed.
 
         Raises:
-            Tripped: if none of them came in time.
+            SafetyStop: if no output came in time.
         """
         for _ in range(samples):
             self._take_missed_ticks(late=True)
@@ -88,14 +88,17 @@ class SampleLoop:
         self._check_lost_outputs(samples)
 
     def skip_elapsed_ticks(self) -> None:
-        """Nobody looked for a while: the ticks that have passed are missing, and none of them is late."""
-        while self._take_missed_ticks(late=False):  # the estimator, too, takes its time to hear of it
+        """Take the ticks that have passed as missing, but not late."""
+        while self._take_missed_ticks(late=False):  # ticks may pass while the estimator is updated
             pass
 
     def play(self, next_input: InputFunction, samples: int, on_progress: Callable[[int], None]) -> None:
-        """Play so many ticks, missed ones included; then the input is zero, and its last response is read.
+        """Play inputs, then zero the input and read the response to the last one.
 
-        ``on_progress`` is called with the number of ticks after each.
+        Args:
+            next_input: chooses the inputs.
+            samples: number of ticks, missed ones included.
+            on_progress: called with the number of ticks after each.
         """
         commanded = next_input(0, self._applied_input, self._last_output)
         self.skip_elapsed_ticks()
@@ -105,7 +108,7 @@ class SampleLoop:
                 continue
             self._clock.wait(self._next_tick_time)
             if self._clock.now() > self._next_tick_time + MAX_TICK_DELAY * self._step:
-                continue  # woken too late: `_take_missed_ticks` takes it
+                continue  # woken too late: this tick is a missed one
             self._take_sample(commanded if k < samples else 0.0)
             on_progress(min(self.tick - start, samples))
             if self.tick - start < samples:
@@ -113,29 +116,29 @@ class SampleLoop:
 
     @property
     def warning(self) -> str:
-        """What speaks against a run that was complete; empty where nothing does."""
-        if self.lost <= _MAX_LOST_FRACTION * self.tick:
+        """A warning where many outputs were lost, else an empty text."""
+        if self.lost_outputs <= _MAX_LOST_FRACTION * self.tick:
             return ""
-        return (
-            f"{self.lost} of {self.tick} outputs came too late to be used: intervals may be too narrow; {_LATE_REMEDY}"
-        )
+        lost = f"{self.lost_outputs} of {self.tick} outputs came too late to be used"
+        return f"{lost}: intervals may be too narrow; {_LATE_REMEDY}"
 
     @property
     def _next_tick_time(self) -> float:
-        """When the next tick is."""
+        """Time of the next tick [s]."""
         return self._start_time + self.tick * self._step
 
     def _take_missed_ticks(self, late: bool) -> bool:
-        """Take the ticks that were missed; whether there were any."""
+        """Take the ticks that were missed; returns whether there were any."""
         behind = (self._clock.now() - self._next_tick_time) / self._step - MAX_TICK_DELAY
         if behind <= 0:
             return False
         missed = math.ceil(behind)
-        self._record_and_update([self._applied_input] * missed, [math.nan] * missed, None, late, missed if late else 0)
+        lost = missed if late else 0
+        self._record_and_update([self._applied_input] * missed, [math.nan] * missed, None, late, lost)
         return True
 
     def _take_sample(self, commanded: float, apply: bool = True) -> None:
-        """Read, and apply; find out when that was."""
+        """Read the output and apply the input, and measure when both happened."""
         due, now = self._next_tick_time, self._clock.now
         read_start = now()
         y = self._session.read()
@@ -146,7 +149,7 @@ class SampleLoop:
         read_time = (read_start + read_end) / 2
         in_time = read_time <= due + MAX_TICK_DELAY * self._step
         previous_input = self._applied_input
-        # What of the tick, which is when the output was read, had passed when the input changed.
+        # Time from the tick, which is when the output was read, to the change of the input [sampling steps].
         elapsed_steps = ((read_end + apply_end) / 2 - (read_time if in_time else due)) / self._step if apply else 0.0
         full_steps, remainder = divmod(max(0.0, elapsed_steps), 1.0)
         self._applied_input = applied
@@ -168,36 +171,41 @@ class SampleLoop:
         lost: int,
         read_output: float | None = None,
     ) -> None:
-        """Ticks with the mean inputs of their samples, and their outputs: write them down, judge them, learn from them.
+        """Record ticks, check the output that was read, and update the estimator.
 
-        What is late is so in all of them, and the lost outputs are the last of them; what was read at the first is not
-        among its outputs where it came too late.
+        Args:
+            u: mean input of each tick.
+            y: output of each tick, NaN where it is missing or late.
+            commanded: the input that was chosen.
+            late: whether the ticks are late.
+            lost: number of lost outputs, the last ones of ``y``.
+            read_output: the output that was read at the first tick, also where it is late and not in ``y``.
         """
         count, clock = len(u), self._clock.now() - self._start_time
         ticks = range(self.tick, self.tick + count)
-        rows = [[k, k * self._step, u[i], y[i], commanded, 0, int(late), clock, None] for i, k in enumerate(ticks)]
+        rows = [SampleRow(k, k * self._step, u[i], y[i], commanded, 0, int(late), clock) for i, k in enumerate(ticks)]
         if lost == count:
-            rows[0][-1] = read_output
+            rows[0] = rows[0]._replace(late_output=read_output)
         self._recording.write_rows(rows)
         if late:
-            self.late += count
+            self.late_ticks += count
             self._recording.log_event("late", tick=self.tick, ticks=count)
-        self.lost += lost
+        self.lost_outputs += lost
         self._consecutive_lost = self._consecutive_lost + lost if lost == count else lost
         if read_output is not None:
-            self._session.check(np.array([read_output]))
+            self._session.check_outputs(np.array([read_output]))
         self._run_estimator.update([self._last_mean_input, *u[:-1]], y)
         self._last_mean_input, self._last_output = u[-1], y[-1] if count > 1 or read_output is None else read_output
         self.tick += count
-        if self._session.stale:
-            self._check_lost_outputs(self._session.stale)
+        if self._session.max_stale:
+            self._check_lost_outputs(self._session.max_stale)
 
     def _check_lost_outputs(self, limit: int) -> None:
-        """Refuse to go on where so many outputs in a row were lost."""
+        """Stop where ``limit`` outputs in a row were lost."""
         if self._consecutive_lost >= limit:
             read, apply = (f"{1e3 * seconds:.4g} ms" for seconds in self._call_durations)
             raise SafetyStop(
-                "late",
+                StopReason.LATE,
                 f"{self._consecutive_lost} outputs in a row came too late: read() took {read} and apply() {apply} of a "
                 f"step of {1e3 * self._step:.4g} ms; {_LATE_REMEDY}",
             )

@@ -1,4 +1,4 @@
-"""A simulated plant of a rig, to try a run without hardware: Eq. (1), integrated here, and not by the engine."""
+"""A simulated plant of a rig, to try a run without hardware: Eq. (1), integrated independently of the engine."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from estimator.rigs.units import MAGNITUDE_BOUNDS
 from estimator.support.argument_checks import MAX_SEED, check_integer, check_number, short_repr
 from estimator.support.array_types import FloatArray
 
-#: Runge-Kutta steps of a sampling step.
+#: Runge-Kutta steps in a sampling step.
 _RK4_SUBSTEPS = 8
 
-#: Longest stretch that is integrated, in samples: of a longer pause the rest is left out.
+#: Longest pause that is integrated [samples]; the rest of a longer one is left out.
 _MAX_SAMPLES_INTEGRATED = 2_000
 
-#: The same as long as nothing has driven it: to catch up with more takes longer than the step of a fast rig.
+#: The same before any input was applied [samples]: more would take longer than the sampling step of a fast rig.
 _MAX_SAMPLES_AT_REST = 20
 
-#: A noise that the rig does not give, in parts of the input's limit or the output's range.
+#: Standard deviation of a noise that the rig does not give, as a fraction of the input's limit or the output's range.
 _DEFAULT_NOISE_RATIO = 1e-4
 
-#: Between two blocks an unknown time passes; here up to so many samples.
+#: Longest pause between two blocks, whose length is drawn [samples].
 _MAX_SAMPLES_BETWEEN_BLOCKS = 200
 
 
 class SimulatedPlant:
     """An oscillator that follows the clock, or plays blocks at once.
 
-    Its parameters are the middle of the rig's guess, its noises those of the channels; where the rig gives none, a
-    ten-thousandth of the limit and of the range. It watches as an instrument does: silence of the watchdog's time
-    brings its input to zero.
+    Its parameters are the middle of the rig's guess, and its noises are the channels' noises; where the rig gives none,
+    1e-4 of the limit and of the range. It has a watchdog, as an instrument does: after the watchdog's time of silence
+    its input is zero.
 
-    Time begins with its first call, and not when it is made: a run loads, compiles and plans in between. Until an input
-    drives it, it rests but for its noises, and a pause of more than 20 samples between two calls counts as one of 20;
-    later one of more than 2,000 as one of 2,000. So no call takes long because of what went by before the run.
+    Time begins with the first call, because a run loads, compiles and plans between the constructor and this call.
+    Before any input was applied, a pause of more than 20 samples between two calls counts as 20 samples; later a pause
+    of more than 2,000 counts as 2,000. So no call takes long because of a pause before the run.
 
     Args:
-        rig: with a guess, or ``truth``.
+        rig: with a guess where ``truth`` is None.
         truth: m, c, a and b in the rig's units, in place of the middle of the guess.
         seed: of the noises.
-        clock: the machine's where it is None.
+        clock: the machine's clock where it is None.
 
     Raises:
-        ValueError: for a rig without a guess where no truth is given, or with a delay; for a truth that is not m, c, a
+        ValueError: for a rig without a guess where there is no truth, a rig with a delay, a truth that is not m, c, a
             and b, or a seed that is no whole number.
     """
 
@@ -82,7 +82,7 @@ class SimulatedPlant:
 
     @property
     def applied(self) -> float:
-        """The input now, whoever brought it there."""
+        """The input now, also where the watchdog zeroed it."""
         self._integrate_to_now()
         return self._u
 
@@ -92,7 +92,7 @@ class SimulatedPlant:
         self._armed, self._watchdog = True, math.inf if watchdog is None else watchdog
 
     def apply(self, u: float) -> float:
-        """An input from now on; 0 where the plant is disarmed."""
+        """Apply an input from now on; 0 where the plant is disarmed."""
         self._register_call()
         self._u = self._clamp_input(u)
         return self._u
@@ -103,7 +103,7 @@ class SimulatedPlant:
         return self._sensor_output()
 
     def play(self, u: FloatArray) -> tuple[npt.ArrayLike, npt.ArrayLike]:
-        """Play inputs at once, after a pause of an unknown length; the clock stands still."""
+        """Play inputs at once, after a pause whose length is drawn; the clock stands still."""
         self._register_call()
         self._u = 0.0
         self._integrate(int(self._rng.integers(_MAX_SAMPLES_BETWEEN_BLOCKS)))
@@ -113,18 +113,17 @@ class SimulatedPlant:
             applied[k] = self._u = self._clamp_input(value)
             self._integrate(1.0)
         self._u = 0.0
-        self._last_call_time = self._integrated_until = (
-            self.clock.now()
-        )  # what passed on the clock meanwhile was the block
+        # The time on the clock that this took was the block.
+        self._last_call_time = self._integrated_until = self.clock.now()
         return applied, outputs
 
     def zero(self) -> None:
-        """The input to zero."""
+        """Bring the input to zero."""
         self._register_call()
         self._u = 0.0
 
     def disarm(self) -> None:
-        """The input to zero, and no other after it."""
+        """Bring the input to zero, and let no input through any more."""
         self.zero()
         self._armed = False
 
@@ -139,7 +138,7 @@ class SimulatedPlant:
         self._last_call_time = self.clock.now()
 
     def _integrate_to_now(self) -> None:
-        """Follow the clock; the watchdog bites on the way."""
+        """Integrate up to the time on the clock; the watchdog may zero the input on the way."""
         now = self.clock.now()
         if math.isnan(self._integrated_until):
             self._last_call_time = self._integrated_until = now
@@ -150,12 +149,8 @@ class SimulatedPlant:
         self._integrate_until(now)
 
     def _integrate_until(self, time: float) -> None:
-        self._integrate(
-            min(
-                (time - self._integrated_until) / self.rig.step,
-                float(_MAX_SAMPLES_INTEGRATED if self._has_been_driven else _MAX_SAMPLES_AT_REST),
-            )
-        )
+        longest = float(_MAX_SAMPLES_INTEGRATED if self._has_been_driven else _MAX_SAMPLES_AT_REST)
+        self._integrate(min((time - self._integrated_until) / self.rig.step, longest))
         self._integrated_until = time
 
     def _sensor_output(self) -> float:
@@ -164,7 +159,7 @@ class SimulatedPlant:
         return value + self.rig.output.offset + self._noise_stds[1] * self._rng.standard_normal()
 
     def _integrate(self, samples: float) -> None:
-        """Runge and Kutta's method, with a force noise that is new for every sample."""
+        """Integrate by the classical Runge-Kutta method, with a new force noise in every sample."""
         while samples > 1e-9:
             part = min(samples, 1.0)
             self._process_noise_force = self._noise_stds[0] * self._rng.standard_normal()
@@ -189,18 +184,18 @@ class SimulatedPlant:
 
 
 def check_true_parameters(truth: object) -> None:
-    """Refuse what are not m, c, a and b."""
+    """Refuse true parameters that are not m, c, a and b.
+
+    Raises:
+        ValueError: naming the parameter.
+    """
     if not isinstance(truth, Mapping) or set(truth) != set("mcab"):
         raise ValueError(f"truth must give m, c, a and b, but is {short_repr(truth)}")
     for name in "mcab":
-        check_number(
-            f"truth of {name}",
-            truth[name],
-            MAGNITUDE_BOUNDS[0] if name == "m" else -MAGNITUDE_BOUNDS[1],
-            MAGNITUDE_BOUNDS[1],
-        )
+        smallest = MAGNITUDE_BOUNDS[0] if name == "m" else -MAGNITUDE_BOUNDS[1]
+        check_number(f"truth of {name}", truth[name], smallest, MAGNITUDE_BOUNDS[1])
 
 
 def plant(rig: Rig, seed: int = 0, truth: Mapping[str, float] | None = None, **instrument: object) -> SimulatedPlant:
-    """For ``--plant agents.hardware.simulated_plant:plant``; seed and truth may stand in the rig file's table [instrument]."""
+    """The factory of ``--plant agents.hardware.simulated_plant:plant``; [instrument] may hold seed and truth."""
     return SimulatedPlant(rig, truth, seed)

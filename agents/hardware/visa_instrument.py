@@ -1,11 +1,11 @@
-"""An instrument as a plant, over PyVISA: what it is told stands in the table ``[instrument]`` of the rig file."""
+"""A SCPI instrument as a plant, over PyVISA; its commands stand in the table ``[instrument]`` of the rig file."""
 
 from __future__ import annotations
 
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +15,18 @@ from estimator.support.argument_checks import check_number, short_repr
 from estimator.support.array_types import FloatArray
 from estimator.support.optional_dependencies import require_packages
 
-#: What each command may have in braces.
+#: Placeholders in braces that each command has; the others have none.
 _PLACEHOLDERS = {"set": {"u"}, "watchdog": {"seconds"}, "upload": {"values"}}
+
+
+class _MessageSession(Protocol):
+    """The part of PyVISA's message-based resource that is used here."""
+
+    timeout: float
+
+    def write(self, message: str) -> object: ...
+    def query(self, message: str) -> str: ...
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -26,24 +36,25 @@ class VisaCommands:
     Attributes:
         resource: VISA's name, such as ``TCPIP::192.168.0.7::5025::SOCKET`` or ``ASRL/dev/ttyUSB0::INSTR``.
         zero: command that brings the input to zero.
-        arm: that lets inputs through.
-        disarm: that lets none through.
-        watchdog: after ``{seconds}`` of silence the instrument is to zero its input; left out where it cannot.
-        set: applies the input ``{u}``; a run by samples needs it, and ``read``. Where it ends with a question, such as
-            ``SOUR:VOLT {u};:SOUR:VOLT?``, the answer is the input that is applied. Over a network it should: what comes
-            after a message without an answer may wait for 40 ms (Nagle's algorithm).
-        read: asks for the output.
-        upload: sends the inputs ``{values}`` of a block, separated by commas; a run by blocks needs it and these:
-        play: plays them, one a sampling step, then zero.
-        outputs: asks for the outputs of the block, separated by commas, when it has been played.
-        inputs: asks for the inputs as they were applied; those sent are taken for them where this is left out.
-        begin: a list of commands when it is opened; ``zero`` follows.
+        arm: command that lets inputs through.
+        disarm: command that lets no input through.
+        watchdog: command that lets the instrument zero its input after ``{seconds}`` of silence; None: it cannot.
+        set: command that applies the input ``{u}``; a run by samples needs ``set`` and ``read``. Where it ends with a
+            question mark, such as ``SOUR:VOLT {u};:SOUR:VOLT?``, the answer is the applied input. Over a network it
+            should: the message after one without an answer may wait for 40 ms (Nagle's algorithm).
+        read: query of the output.
+        upload: command that sends the inputs ``{values}`` of a block, separated by commas; a run by blocks needs
+            ``upload``, ``play`` and ``outputs``.
+        play: command that plays the block, one input per sampling step, then zero.
+        outputs: query of the block's outputs, separated by commas, after it has been played.
+        inputs: query of the inputs as they were applied; None: they are taken to be the inputs that were sent.
+        begin: commands that follow the opening of the connection, before ``zero``.
         timeout: seconds that an answer may take, from 0.001 to 3600.
-        termination: what ends a line, both ways.
-        backend: of PyVISA; ``@py`` is pyvisa-py.
+        termination: end of a line, in both directions.
+        backend: PyVISA's backend; ``@py`` is pyvisa-py.
 
     Raises:
-        ValueError: for a command whose braces are not as above, or a value that is none.
+        ValueError: for a command with other placeholders than named above, or a value of another type.
     """
 
     resource: str
@@ -79,16 +90,17 @@ class VisaCommands:
             placeholders = {name for _, name, _, _ in string.Formatter().parse(value) if name is not None}
             if placeholders != allowed:
                 raise ValueError(
-                    f"instrument.{field.name} must have {sorted(allowed)} in braces, but has {sorted(placeholders)}: {value!r}"
+                    f"instrument.{field.name} must have {sorted(allowed)} in braces, but has {sorted(placeholders)}: "
+                    f"{value!r}"
                 )
 
 
 class VisaInstrument:
-    """A plant that is an instrument. The connection is kept until the program ends, or `close`.
+    """An instrument as a plant. The connection stays open until `close` or the end of the program.
 
     Args:
-        rig: of which the step is taken, to wait for blocks.
-        commands: what it is told.
+        rig: whose sampling step says how long a block takes.
+        commands: messages of the instrument.
 
     Raises:
         ImportError: without PyVISA: ``pip install 'duffing-env[instrument]'``.
@@ -102,11 +114,13 @@ class VisaInstrument:
         self._commands, self._step = commands, rig.step
         self.has_watchdog = commands.watchdog is not None
         # The manager stays open: PyVISA shares it, and to close it would cut off other instruments.
-        connection: Any = None
+        connection: _MessageSession | None = None
         try:
             terminations = {"read_termination": commands.termination, "write_termination": commands.termination}
             manager: Any = pyvisa.ResourceManager(commands.backend)
-            self._connection = connection = manager.open_resource(commands.resource, **terminations)
+            connection = manager.open_resource(commands.resource, **terminations)
+            assert connection is not None
+            self._connection = connection
             connection.timeout = 1000 * commands.timeout
             for line in (*commands.begin, commands.zero):
                 connection.write(line)
@@ -116,16 +130,16 @@ class VisaInstrument:
             raise ValueError(f"instrument.resource {commands.resource!r} cannot be opened: {error}") from error
 
     def __repr__(self) -> str:
-        return f"Instrument({self._commands.resource!r})"
+        return f"VisaInstrument({self._commands.resource!r})"
 
     def arm(self, watchdog: float | None) -> None:
-        """The watchdog first, then let inputs through."""
+        """Set the watchdog, then let inputs through."""
         if watchdog is not None:
             self._connection.write(self._required_command("watchdog").format(seconds=watchdog))
         self._connection.write(self._commands.arm)
 
     def apply(self, u: float) -> float:
-        """Set the input; the answer is what is applied, where there is one."""
+        """Set the input; returns the answer, or ``u`` where the command has none."""
         line = self._required_command("set").format(u=u)
         if line.endswith("?"):
             return float(self._connection.query(line))
@@ -133,33 +147,31 @@ class VisaInstrument:
         return u
 
     def read(self) -> float:
-        """Ask for the output."""
+        """Query the output."""
         return float(self._connection.query(self._required_command("read")))
 
     def play(self, u: FloatArray) -> tuple[npt.ArrayLike, npt.ArrayLike]:
-        """Upload, play, wait, ask."""
+        """Upload the block, play it, and query the outputs when it has ended."""
         self._connection.write(self._required_command("upload").format(values=",".join(map(repr, u.tolist()))))
         self._connection.write(self._required_command("play"))
-        normal_timeout, self._connection.timeout = (
-            self._connection.timeout,
-            self._connection.timeout + 1000 * len(u) * self._step,
-        )
+        normal_timeout = self._connection.timeout
+        self._connection.timeout = normal_timeout + 1000 * len(u) * self._step
         try:
             y = self._query_numbers(self._required_command("outputs"))
-        finally:  # what zeroes the input next must not wait for so long
+        finally:  # the command that zeroes the input next must not wait as long
             self._connection.timeout = normal_timeout
         return u if self._commands.inputs is None else self._query_numbers(self._commands.inputs), y
 
     def zero(self) -> None:
-        """The input to zero."""
+        """Bring the input to zero."""
         self._connection.write(self._commands.zero)
 
     def disarm(self) -> None:
-        """No input any more."""
+        """Let no input through any more."""
         self._connection.write(self._commands.disarm)
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._connection.close()
 
     def _query_numbers(self, query: str) -> FloatArray:
@@ -168,15 +180,15 @@ class VisaInstrument:
     def _required_command(self, command: str) -> str:
         value = getattr(self._commands, command)
         if value is None:
-            raise ValueError(f"instrument.{command} must be in the rig file for this, but is not; add it")
+            raise ValueError(f"instrument.{command} must be in the rig file for this run, but is not; add it")
         return str(value)
 
 
 def plant(rig: Rig, **instrument: Any) -> VisaInstrument:
-    """For ``--plant agents.hardware.visa_instrument:plant``: that of the table ``[instrument]``.
+    """The factory of ``--plant agents.hardware.visa_instrument:plant``: an instrument by the table ``[instrument]``.
 
     Raises:
-        ValueError: as `VisaCommands` and `VisaInstrument`, or for a key that is unknown or missing.
+        ValueError: as of `VisaCommands` and `VisaInstrument`, or for a key that is unknown or missing.
     """
     known = {one.name for one in fields(VisaCommands)}
     missing = {"resource", "zero", "arm", "disarm"} - set(instrument)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import html
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.console_output import check_output_file, check_output_folder, replace_non_finite
-from agents.evaluation.comparison_tables import METRIC_COLUMNS, MetricColumn, center_value
-from agents.evaluation.oracle import ORACLE_FOLDER
-from agents.leaderboard.protocol import PROTOCOL_TRACKS, PROTOCOL_VERSION, SCORE_COLUMN, file_digest
-from estimator.support.argument_checks import mask_control_codes
-from estimator.support.file_io import append_atomically, check_readable_file, write_atomically
+from agents.leaderboard.leaderboard_tables import entry_cells, oracle_digest_of, sort_key
+from agents.leaderboard.protocol import PROTOCOL_VERSION
+from agents.output_paths import check_output_file, check_output_folder
+from agents.result_files import replace_non_finite
+from estimator.support.file_io import append_atomically, check_readable_file
 
 #: The board that ships with the package.
 SHIPPED_LEADERBOARD = Path(__file__).parents[1] / "leaderboard.jsonl"
@@ -23,12 +20,6 @@ SHIPPED_LEADERBOARD = Path(__file__).parents[1] / "leaderboard.jsonl"
 OWN_LEADERBOARD = Path("runs/leaderboard.jsonl")
 
 _MAX_BYTES = 2**26  # bytes
-_SHIFT_NAMES = ("parameters", "noises", "limits", "equation")
-
-COLUMN_TITLES = (
-    "", SCORE_COLUMN.title, "seeds", "budget", "information / nat", "covered / %", "ended early / %",
-    *(f"{shift} / nat" for shift in _SHIFT_NAMES),
-)  # fmt: skip
 
 
 def check_new_entry(path: Path, name: str) -> set[str]:
@@ -85,76 +76,9 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
         try:
             entry = json.loads(line)
             key = str(entry["track"]), str(entry["name"])
-            _sort_key(entry), entry_cells(entry), _oracle_digest(entry)
+            sort_key(entry), entry_cells(entry), oracle_digest_of(entry)
         except Exception as error:  # whatever a file of somebody else's makes of what is shown
             raise ValueError(f"board must hold an entry a line, but {path}:{number} is not one: {error!r}") from error
         if entry.get("protocol") == PROTOCOL_VERSION:
             entries[key] = entry
     return list(entries.values())
-
-
-def stored_oracle_digests() -> set[str]:
-    """Digests of the oracles of this version."""
-    return {file_digest(path) for path in ORACLE_FOLDER.glob("*.npz")}
-
-
-def leaderboard_rows(entries: Sequence[dict[str, Any]]) -> dict[str, list[list[str]]]:
-    """Rows under `COLUMN_TITLES` for each track, the best score first."""
-    ordered = sorted(entries, key=_sort_key)
-    current_oracles = stored_oracle_digests()
-    rows: dict[str, list[list[str]]] = {track: [] for track in PROTOCOL_TRACKS}
-    for entry in ordered:
-        name, score, *others = entry_cells(entry)
-        outdated_mark = "" if _oracle_digest(entry) in current_oracles else " *"
-        rows.setdefault(str(entry["track"]), []).append([name, score + outdated_mark, *others])
-    return {track: found for track, found in rows.items() if found}
-
-
-def _sort_key(entry: dict[str, Any]) -> float:
-    return float(-entry["score"]["iqm"])
-
-
-def _oracle_digest(entry: dict[str, Any]) -> str:
-    return str(entry["reference"]["oracle"])
-
-
-def entry_cells(entry: dict[str, Any]) -> list[str]:
-    """The row of an entry."""
-    metrics = entry["metrics"]
-    shifted = [entry["shifted"].get(shift, {}).get("fisher_gain") for shift in _SHIFT_NAMES]
-    return [
-        mask_control_codes(str(entry["name"])),
-        f"{_format_center(SCORE_COLUMN, entry['score'])} [{', '.join(SCORE_COLUMN.format_value(entry['score'][end]) for end in ('low', 'high'))}]",
-        str(entry["seeds"]),
-        str(entry["budget"]),
-        *(
-            _format_center(METRIC_COLUMNS[name], metrics[name])
-            for name in ("information_gain", "coverage", "ended_early")
-        ),
-        *(_format_center(METRIC_COLUMNS["fisher_gain"], found) for found in shifted),
-    ]
-
-
-def write_leaderboard_page(path: Path, entries: Sequence[dict[str, Any]]) -> None:
-    """Write a page of the boards, which opens without a network."""
-    from estimator.support.html_page import html_document, html_table
-
-    parts = ["<h1>Leaderboard</h1>", f"<p>{LEADERBOARD_CAPTION}</p>"]
-    for track, rows in leaderboard_rows(entries).items():
-        escaped_rows = [[html.escape(cell) for cell in row] for row in rows]
-        parts += [f"<h2>{html.escape(track)}</h2>", html_table(COLUMN_TITLES, escaped_rows)]
-    write_atomically(path, html_document("Leaderboard", parts))
-
-
-LEADERBOARD_CAPTION = (
-    "Score: interquartile mean over seeds and systems of the D-efficiency, against the certified optimum of each "
-    "system that has one and else the best input that is known, with its 95 % bootstrap interval over systems. The "
-    "others are means over 256 systems: information gained, 90 % intervals that cover, episodes that a limit ended, "
-    "and the Fisher information on systems whose parameters, noises, limits or equation are shifted. Budget: samples "
-    "of training (none: it learns nothing; open: more than 10 million). A star marks a score against an earlier oracle."
-)
-
-
-def _format_center(metric: MetricColumn, entry: dict[str, Any] | None) -> str:
-    center = None if entry is None else center_value(entry)
-    return "-" if center is None else metric.format_value(center)

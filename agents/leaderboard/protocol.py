@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.console_output import package_versions
-from agents.evaluation.comparison_tables import IQM, METRIC_COLUMNS, MetricColumn, center_and_interval
+from agents.evaluation.metric_summary import IQM, METRIC_COLUMNS, MetricColumn, center_and_interval
 from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.oracle import Oracle, TrackSystems
 from agents.evaluation.policy_evaluation import Evaluation, run_episodes
@@ -23,6 +22,7 @@ from agents.evaluation.policy_groups import policy_group
 from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import CARD_FILE, MAX_STEPS, WEIGHTS_FILE, training_steps_of
+from agents.result_files import package_versions
 from agents.user_code import load_object
 from estimator.support.argument_checks import check_integer
 from estimator.support.array_types import FloatArray

@@ -239,7 +239,7 @@ def capture_rollout_state(model: BaseAlgorithm) -> TensorDict:
     import torch
 
     envs: Any = model.get_env()
-    if not hasattr(envs, "recall"):
+    if not hasattr(envs, "restore_episode_state"):
         return {}
     numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
@@ -252,7 +252,7 @@ def capture_rollout_state(model: BaseAlgorithm) -> TensorDict:
         "ended": np.array(episodes, dtype=np.float64).reshape(-1, len(_EPISODE_KEYS)),
         "left": np.array(model._current_progress_remaining),
         **{f"lstm/{index}": value.numpy() for index, value in enumerate(_lstm_states(model))},
-        **{f"envs/{name}": array for name, array in envs.memory.items()},
+        **{f"envs/{name}": array for name, array in envs.episode_state.items()},
     }
 
 
@@ -267,7 +267,7 @@ def restore_rollout_state(model: BaseAlgorithm, rollout_state: TensorDict) -> No
     if not rollout_state:
         return
     envs: Any = model.get_env()
-    model._last_obs = envs.recall(tensors_with_prefix(rollout_state, "envs"))
+    model._last_obs = envs.restore_episode_state(tensors_with_prefix(rollout_state, "envs"))
     model._last_episode_starts = rollout_state["starts"]
     model._current_progress_remaining = float(rollout_state["left"])
     for index, value in enumerate(_lstm_states(model)):

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from agents.cli import RIG_TRACK, JsonOptions, check_track_id, full_track_id, options_with_rig
-from agents.console_output import package_versions, write_json
+from agents.json_options import JsonOptions
 from agents.policies.networks.trained_policy import CONFIG_FILE
+from agents.result_files import package_versions, write_json
+from agents.track_ids import RIG_TRACK, check_track_id, full_track_id, options_with_rig
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from agents.console_output import check_output_folder, write_json
 from agents.interruption import InterruptHandler, add_resume_hint
+from agents.output_paths import check_output_folder
 from agents.policies.networks.policy_saving import write_policy
 from agents.policies.networks.trained_policy import CARD_FILE, CONFIG_FILE, training_steps_of
+from agents.result_files import write_json
 from agents.training.checkpoints import (
     TrainingProgress,
     delete_training_states,
@@ -98,7 +99,7 @@ def train(config: TrainConfig, on_evaluation: OnEvaluation = lambda steps, found
     Until it is finished, the latest checkpoint also holds what `resume` goes on from.
 
     Raises:
-        Stopped: after a signal; its ``left`` says whether anything was kept, and how to go on.
+        Interrupted: after a signal; its ``left`` says whether anything was kept, and how to go on.
         ModuleNotFoundError: without the packages of the extra ``train``.
         ValueError: for settings that make no sense, or a folder that another process trains in, before anything is
             written.
@@ -230,24 +231,24 @@ class _TrainingLoop:
         with ExitStack() as stack:
             on_progress = stack.enter_context(show_progress("Training"))
             on_progress(first_step / total)
-            ended = ""
+            episode_note = ""
 
             def on_step(steps: int) -> None:
-                on_progress(min(steps / total, 1.0), ended)
+                on_progress(min(steps / total, 1.0), episode_note)
 
             def on_rollout(steps: int, mean_return: float) -> None:
-                nonlocal ended
+                nonlocal episode_note
                 self._progress.curve.append(
                     (steps, self._elapsed_seconds(), None if math.isnan(mean_return) else mean_return)
                 )
-                ended = "no episode has ended" if math.isnan(mean_return) else f"return {mean_return:.2f}"
+                episode_note = "no episode has ended" if math.isnan(mean_return) else f"return {mean_return:.2f}"
                 on_step(steps)
 
             def on_update() -> None:
                 self._on_update()
                 if interrupt_handler.is_requested and self._model.num_timesteps < total:
                     self._save_checkpoint()
-                    interrupt_handler.check(_resume_hint(self._folder))
+                    interrupt_handler.raise_if_interrupted(_resume_hint(self._folder))
 
             interrupt_handler = stack.enter_context(InterruptHandler(_INTERRUPT_PATIENCE))
             self._model.learn(

@@ -48,7 +48,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Kill, and print the table."""
-    from agents.console_output import format_table, print_texts_and_tables, write_json
+    from agents.console_output import format_table, print_texts_and_tables
+    from agents.result_files import write_json
 
     unknown = set(config.commands) - set(CASES)
     if unknown:

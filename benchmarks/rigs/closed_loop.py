@@ -192,9 +192,9 @@ def _play_blocks(rig: Rig, plant: BenchPlant, policy: str, seed: int, max_input:
     )
     with tempfile.TemporaryDirectory() as folder:
         outcome = run_experiment(rig, plant, folder, plan, clock=JumpingClock())
-    if outcome.ended not in ("complete", "range", "design"):
+    if outcome.outcome not in ("complete", "range", "design"):
         raise RuntimeError(f"a run in blocks ended: {outcome.message}")
-    return outcome.belief, outcome.ended
+    return outcome.belief, outcome.outcome
 
 
 def run_trials(

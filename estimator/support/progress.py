@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
+from typing import TypeVar
 
 from estimator.support.argument_checks import mask_control_codes
 
-#: Shortest time to the first line and between lines, where stderr is no terminal [s].
+Task = TypeVar("Task")
+
+#: Seconds until the first line where stderr is no terminal, and at least between two.
 REPORT_INTERVAL = 5.0
 
 #: Longest line [characters].
@@ -104,4 +107,13 @@ def _terminal_bar() -> Iterator[Callable[[float, str], None]]:
     columns = BarColumn(12), TextColumn("{task.description}", markup=False)
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda share, line: bar.update(task, completed=share, description=line[: console.width - 14])
+        yield lambda share, said: bar.update(task, completed=share, description=said[: console.width - 14])
+
+
+def iterate_with_progress(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:
+    """Yield the tasks of (name, task), one after the other, while `show_progress` shows the name of the current one."""
+    tasks = list(tasks)
+    with show_progress() as on_progress:
+        for done, (name, task) in enumerate(tasks):
+            on_progress(done / len(tasks), name)
+            yield task

@@ -38,12 +38,14 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from agents.cli import JsonOptions, iterate_with_progress, run_script
+from agents.cli import run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import Oracle, TrackSystems
+from agents.json_options import JsonOptions
 from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from estimator.support.array_types import FloatArray
+from estimator.support.progress import iterate_with_progress
 from research.oracles.input_mixture import BoundMultipliers, InformationMoments, improve_mixture
 from research.oracles.state_grid import StateGrid
 

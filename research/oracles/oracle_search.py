@@ -24,9 +24,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.cli import JsonOptions, iterate_with_progress, run_script
+from agents.cli import run_script
 from agents.console_output import print_texts_and_tables
 from agents.evaluation.oracle import QUANTISATION_LEVELS, Oracle, TrackSystems, quantise
+from agents.json_options import JsonOptions
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from agents.planning.model_probe import ModelView
 from agents.planning.plan_objective import PlanObjective
@@ -35,6 +36,7 @@ from agents.planning.time_scales import probe_time_scales
 from estimator.belief import Belief
 from estimator.support.argument_checks import MAX_SEED, check_integer
 from estimator.support.array_types import FloatArray
+from estimator.support.progress import iterate_with_progress
 from research.oracles.beam_start import compile_beam_start
 from research.oracles.linear_programme import import_highspy
 from research.oracles.slp_refinement import refine_input

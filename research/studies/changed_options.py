@@ -17,12 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from agents.cli import iterate_with_progress, run_script
-from agents.console_output import format_table, print_texts_and_tables, write_json
-from agents.evaluation.comparison_tables import METRIC_COLUMNS, center_and_interval_text
+from agents.cli import run_script
+from agents.console_output import format_table, print_texts_and_tables
+from agents.evaluation.metric_summary import METRIC_COLUMNS, center_and_interval_text
 from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.policy_evaluation import run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
+from agents.result_files import write_json
+from estimator.support.progress import iterate_with_progress
 
 #: What is compared: a title, the track without its version, the options.
 CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (

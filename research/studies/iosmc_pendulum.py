@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.cli import run_script
 from agents.console_output import format_table, print_texts_and_tables
-from agents.evaluation.comparison_tables import METRIC_COLUMNS, center_and_interval_text
+from agents.evaluation.metric_summary import METRIC_COLUMNS, center_and_interval_text
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
 from agents.user_code import attribute_user_errors

@@ -16,21 +16,17 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from agents.cli import iterate_with_progress
-from agents.console_output import (
-    check_output_file,
-    format_table,
-    package_versions,
-    print_texts_and_tables,
-    write_json,
-)
+from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.figures import new_figure, save_png
+from agents.output_paths import check_output_file
 from agents.policies import make_policy
+from agents.result_files import package_versions, write_json
 from duffing_env.plants.silverbox_record import Regime, SilverboxRecord, load_record
 from estimator import OnlineEstimator, Rig, difference, published_run_prior
 from estimator.belief import Belief
 from estimator.inference.pem_narx import PEMNARX
 from estimator.support.array_types import FloatArray
+from estimator.support.progress import iterate_with_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

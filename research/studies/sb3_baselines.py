@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from agents.cli import check_track_id, full_track_id, run_script
+from agents.cli import run_script
+from agents.track_ids import check_track_id, full_track_id
 from estimator.support.optional_dependencies import require_packages
 
 
@@ -48,8 +49,8 @@ def main(config: Config) -> None:
     from sb3_contrib import TQC
     from stable_baselines3 import PPO, SAC
 
-    from agents.console_output import package_versions
     from agents.policies.networks.policy_saving import check_policy_folder, save_policy
+    from agents.result_files import package_versions
 
     check_policy_folder("folder", config.folder)
     torch.set_num_threads(1)

@@ -21,10 +21,12 @@ import numpy as np
 
 from agents import policies
 from agents.cli import run_script
-from agents.console_output import print_texts_and_tables, write_json
-from agents.evaluation.comparison_tables import print_comparison_table, summarise_metrics
+from agents.console_output import print_texts_and_tables
+from agents.evaluation.comparison_tables import print_comparison_table
+from agents.evaluation.metric_summary import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies, pool_seeds
 from agents.policies.networks.trained_policy import CARD_FILE, WEIGHTS_FILE
+from agents.result_files import write_json
 from agents.training.environments.oscillator_family import FAMILY
 from estimator.support.file_io import write_atomically
 from research.studies.unseen_oscillators import draw_unseen_rigs, play_episode

@@ -12,18 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from agents.cli import iterate_with_progress
-from agents.console_output import (
-    check_output_file,
-    format_table,
-    package_versions,
-    print_texts_and_tables,
-    replace_non_finite,
-    write_json,
-)
+from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.figures import save_png
+from agents.output_paths import check_output_file
+from agents.result_files import package_versions, replace_non_finite, write_json
 from duffing_env.plants.silverbox_record import Regime, load_record
 from estimator import recorded_prior
+from estimator.support.progress import iterate_with_progress
 from research.studies.silverbox_figures import protocol_figures
 from research.studies.silverbox_protocol import (
     N_GIVEN_OUTPUTS,

@@ -17,13 +17,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from agents.cli import RIG_TRACK, iterate_with_progress, run_script
-from agents.console_output import format_table, print_texts_and_tables, write_json
+from agents.cli import run_script
+from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.policy_groups import check_policies_can_play
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
+from agents.result_files import write_json
+from agents.track_ids import RIG_TRACK
 from agents.training.environments.oscillator_family import FamilyMember, draw_oscillator
 from agents.user_code import attribute_user_errors
+from estimator.support.progress import iterate_with_progress
 
 PLANNER = "efe"
 

@@ -13,8 +13,10 @@ import pytest
 import tyro
 from tables import table
 
-from agents.cli import JsonOptions, options_with_rig, run_script
+from agents.cli import run_script
 from agents.commands import main
+from agents.json_options import JsonOptions
+from agents.track_ids import options_with_rig
 from agents.training import TrainConfig
 from agents.training.hyperparameters import track_name
 from estimator import Rig

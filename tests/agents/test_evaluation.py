@@ -570,7 +570,9 @@ def test_a_place_that_cannot_be_written_is_found_before_the_work(tmp_path, monke
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    monkeypatch.setattr("agents.evaluation.comparison.evaluate", lambda *_: pytest.fail("it was measured first"))
+    monkeypatch.setattr(
+        "agents.evaluation.comparison.evaluate_policies", lambda *_: pytest.fail("it was measured first")
+    )
     with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*out'"):
         compare_policies(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "out")
     with pytest.raises(PermissionError, match=r"allow to write there, or name another place: '.*'"):

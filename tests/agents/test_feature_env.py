@@ -110,8 +110,8 @@ def test_episodes_are_gone_on_with_where_they_were_recalled():
     first.reset()
     for _ in range(10):
         shown, *_ = first.step(rng.integers(3, size=6))
-    memory = {name: array.copy() for name, array in first.venv.memory.items()}
-    np.testing.assert_array_equal(second.recall(memory), shown)
+    memory = {name: array.copy() for name, array in first.venv.episode_state.items()}
+    np.testing.assert_array_equal(second.restore_episode_state(memory), shown)
     for _ in range(30):
         choices = rng.integers(3, size=6)
         for one, two in zip(first.step(choices)[:3], second.step(choices)[:3], strict=True):

@@ -13,13 +13,11 @@ import agents.evaluation.figures
 import agents.evaluation.policy_evaluation
 from agents.evaluation.comparison import compare_policies
 from agents.evaluation.comparison_tables import (
-    METRIC_COLUMNS,
     comparison_table,
     policy_by_estimator_table,
     print_comparison_table,
     print_estimator_table,
     print_headline_table,
-    summarise_metrics,
     write_evaluations,
 )
 from agents.evaluation.figures import (
@@ -28,6 +26,7 @@ from agents.evaluation.figures import (
     plot_posterior_contraction,
     save_png,
 )
+from agents.evaluation.metric_summary import METRIC_COLUMNS, summarise_metrics
 from agents.evaluation.policy_evaluation import Evaluation
 from estimator import SILVERBOX_SAMPLING_STEP
 from estimator.rigs.units import VOLT_SCALES, Scales

@@ -11,7 +11,7 @@ from tables import table
 
 from agents.commands import main
 from agents.evaluation.oracle import Oracle, TrackSystems
-from agents.leaderboard import leaderboard_file, protocol
+from agents.leaderboard import leaderboard_file, leaderboard_tables, protocol
 from agents.policies import POLICIES
 
 SHORT = "duffing_env/Short-v0"
@@ -22,7 +22,7 @@ PRBS = ("--protocol", "Short-v0", "--policies", "prbs")
 def entry():
     """What uniform noise is worth, on few systems."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(protocol, "SYSTEMS", 8)
+        patch.setattr(protocol, "N_SYSTEMS", 8)
         return protocol.measure_policy("uniform", SHORT, "noise")
 
 
@@ -30,7 +30,7 @@ def entry():
 def command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(protocol, "SYSTEMS", 8)
+    monkeypatch.setattr(protocol, "N_SYSTEMS", 8)
 
     def run(*words):
         try:
@@ -60,7 +60,7 @@ def test_a_policy_of_one_s_own_reaches_the_board_with_one_command(command, tmp_p
 
 
 def test_what_the_protocol_fixes_may_be_said(command, entry, monkeypatch):
-    monkeypatch.setattr(protocol, "measure", lambda *arguments: entry)
+    monkeypatch.setattr(protocol, "measure_policy", lambda *arguments: entry)
     said = ("--env", "Short-v0", "--systems", "256", "--seed", "0", "--options", "{}")
     assert command("evaluate", *PRBS, *said)[0] == 0
 
@@ -81,7 +81,7 @@ def test_the_score_is_against_the_bound_where_there_is_one(entry):
 
 
 def test_what_is_measured_twice_is_the_same(entry, monkeypatch):
-    monkeypatch.setattr(protocol, "SYSTEMS", 8)
+    monkeypatch.setattr(protocol, "N_SYSTEMS", 8)
     again = protocol.measure_policy("uniform", SHORT, "noise")
     for part in (entry, again):
         part["metrics"].pop("decision_time", None)
@@ -140,7 +140,7 @@ def test_what_is_no_submission_is_refused(command, words, message, tmp_path):
 
 
 def test_blanks_around_a_name_do_not_make_it_another(tmp_path, monkeypatch, entry):
-    monkeypatch.setattr(leaderboard_file, "SHIPPED", tmp_path / "shipped.jsonl")
+    monkeypatch.setattr(leaderboard_file, "SHIPPED_LEADERBOARD", tmp_path / "shipped.jsonl")
     leaderboard_file.append_entry(leaderboard_file.SHIPPED_LEADERBOARD, entry | {"name": " push "})
     for name in ("push", "push "):
         with pytest.raises(ValueError, match="which the board that ships has; name another"):
@@ -159,7 +159,7 @@ def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
     for seeds in (1, 2):
         leaderboard_file.append_entry(path, entry | {"seeds": seeds})
     leaderboard_file.append_entry(path, entry | {"name": "other", "protocol": 0})
-    monkeypatch.setattr(leaderboard_file, "digest", None)  # to read is not to compare with the oracles
+    monkeypatch.setattr(leaderboard_tables, "file_digest", None)  # to read is not to compare with the oracles
     (found,) = leaderboard_file.read_entries(path)
     assert found["seeds"] == 2
 
@@ -194,7 +194,7 @@ def test_names_of_the_board_that_ships_are_taken(command, tmp_path):
 
 
 def test_a_name_that_is_submitted_twice_is_told(tmp_path, command, entry, monkeypatch):
-    monkeypatch.setattr(protocol, "measure", lambda *arguments: entry)
+    monkeypatch.setattr(protocol, "measure_policy", lambda *arguments: entry)
     words = ("evaluate", "--protocol", "Short-v0", "--policies", "uniform", "--submit", "noise", "--board", "b.jsonl")
     first, second = command(*words)[1], command(*words)[1]
     told = f"The board had noise on {SHORT} before; the report shows the latest entry of a name."
@@ -206,7 +206,7 @@ def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_p
     def measure(*arguments):
         raise AssertionError("it is refused before")
 
-    monkeypatch.setattr(protocol, "measure", measure)
+    monkeypatch.setattr(protocol, "measure_policy", measure)
     words = ("evaluate", "--protocol", "Short-v0", "--policies", "prbs", "--submit", "mine", "--board")
     (tmp_path / "broken.jsonl").write_text(json.dumps(entry) + "\n" + json.dumps(entry)[:200])
     before = (tmp_path / "broken.jsonl").read_bytes()
@@ -250,8 +250,8 @@ def test_the_board_that_ships_is_of_what_ships():
 
 
 def test_a_score_against_another_oracle_is_marked(entry, monkeypatch):
-    ((row,),) = leaderboard_file.leaderboard_rows([entry]).values()
+    ((row,),) = leaderboard_tables.leaderboard_rows([entry]).values()
     assert "*" not in row[1]
-    monkeypatch.setattr(leaderboard_file, "stored_oracle_digests", set)
-    ((row,),) = leaderboard_file.leaderboard_rows([entry]).values()
+    monkeypatch.setattr(leaderboard_tables, "stored_oracle_digests", set)
+    ((row,),) = leaderboard_tables.leaderboard_rows([entry]).values()
     assert row[1].endswith("] *")

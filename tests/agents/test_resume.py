@@ -315,7 +315,7 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
     ("where", "left"),
     [
         ("_make_training_envs", "nothing was kept"),
-        ("_Training._learn", "nothing was kept; begin again with: duffing-env train"),
+        ("_TrainingLoop._learn", "nothing was kept; begin again with: duffing-env train"),
     ],
 )
 def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left):
@@ -324,7 +324,7 @@ def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, mon
         def stop(*arguments, error=error):
             raise error
 
-        monkeypatch.setattr(f"agents.training.runs.{where}", stop)
+        monkeypatch.setattr(f"agents.training.training_run.{where}", stop)
         folder = tmp_path / f"run-{number}"
         with pytest.raises(Interrupted) as caught:
             train(config("ppo", folder))

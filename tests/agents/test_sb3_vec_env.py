@@ -340,8 +340,8 @@ def test_episodes_go_on_in_other_environments_from_a_copy_of_the_memory(track, o
     one.reset()
     for _ in range(7):
         seen, *_ = one.step(rng.uniform(-1, 1, (11, 1)).astype(np.float32))
-    copied = {name: array.copy() for name, array in one.memory.items()}
-    np.testing.assert_array_equal(other.recall(copied), seen)
+    copied = {name: array.copy() for name, array in one.episode_state.items()}
+    np.testing.assert_array_equal(other.restore_episode_state(copied), seen)
     for _ in range(70):
         actions = rng.uniform(-1, 1, (11, 1)).astype(np.float32)
         (seen, rewards, dones, told), (*others, other_told) = one.step(actions), other.step(actions)

@@ -18,11 +18,11 @@ from tables import table
 import agents.sb3_vec_env
 from agents import make_policy
 from agents.commands.train_command import TrainCommand
-from agents.console_output import write_json
-from agents.evaluation.comparison_tables import summarise_metrics
+from agents.evaluation.metric_summary import summarise_metrics
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies.networks.feature_names import FEATURE_NAMES
+from agents.result_files import write_json
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.hyperparameters import parse_hyperparameters
 from agents.training.training_config import describe_run

@@ -127,7 +127,9 @@ def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
     assert not (tmp_path / "search").exists()
 
 
-@pytest.mark.parametrize(("words", "work"), [(["--tune", "3"], "tune"), (["--seeds", "2"], "train_seeds")])
+@pytest.mark.parametrize(
+    ("words", "work"), [(["--tune", "3"], "tune_hyperparameters"), (["--seeds", "2"], "train_seeds")]
+)
 def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, work, monkeypatch, capsys):
     def stopped(*arguments, **options):
         raise Interrupted(signal.SIGTERM, "go on with: duffing-env train --resume one of them")
@@ -141,7 +143,9 @@ def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, wor
 
 
 def test_a_search_says_how_its_best_is_trained_with(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(agents.commands.train_command, "tune", lambda *arguments, **options: tmp_path / "the best.toml")
+    monkeypatch.setattr(
+        agents.commands.train_command, "tune_hyperparameters", lambda *arguments, **options: tmp_path / "the best.toml"
+    )
     main("duffing-env train", ["--env", "Short-v0", "--tune", "3"])
     assert " ".join(capsys.readouterr().out.split()).endswith(
         f"the same command, with --settings '{tmp_path / 'the best.toml'}' in place of --tune and --output"

@@ -115,9 +115,9 @@ def quick():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("matplotlib.figure.Figure.savefig", savefig)
-        patch.setattr(protocol, "SYSTEMS", 8)
-        for module in ("run", "simulated"):
-            patch.setattr(f"agents.running.{module}.RealClock", lambda: clock)
+        patch.setattr(protocol, "N_SYSTEMS", 8)
+        for module in ("experiment_run", "simulated_plant"):
+            patch.setattr(f"agents.hardware.{module}.RealClock", lambda: clock)
         yield
 
 

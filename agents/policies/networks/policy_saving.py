@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.console_output import check_output_folder
+from agents.output_paths import check_output_folder
 from agents.policies.custom_policies import check_wrappers, wrapped_environments
 from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.policies.networks.trained_policy import (

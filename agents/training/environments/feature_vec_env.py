@@ -104,9 +104,9 @@ class FeatureVecEnv(VecEnvWrapper):
         """Start an episode in every row."""
         return self._to_features(self.venv.reset())
 
-    def recall(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
-        """As `DuffingVecEnv.recall`."""
-        return self._to_features(self.venv.recall(memory))  # type: ignore[attr-defined]
+    def restore_episode_state(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
+        """As `DuffingVecEnv.restore_episode_state`."""
+        return self._to_features(self.venv.restore_episode_state(memory))  # type: ignore[attr-defined]
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take what the network chose."""

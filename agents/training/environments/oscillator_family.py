@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.cli import RIG_TRACK
+from agents.track_ids import RIG_TRACK
 
 #: What is trained on it, in the place of a track.
 FAMILY = "family"

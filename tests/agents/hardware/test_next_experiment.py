@@ -43,7 +43,7 @@ def test_what_is_stated_after_an_experiment_is_what_was_expected(policy, designe
     plant.arm(None)
     _, y = plant.play(found.u)
     assert np.abs(y).max() < RIG.output.range
-    low, median, high = found.shown
+    low, median, high = found.output_quantiles
     assert (low < median).all()
     assert (median < high).all()
     assert max(-low.min(), high.max()) < RIG.output.range
@@ -66,7 +66,7 @@ def test_a_run_of_the_planner_is_that_of_its_seed(block, tmp_path):
         clock = JumpingClock()
         plant = SimulatedPlant(RIG, TRUTH, clock=clock)
         plan = RunSettings(policy="efe", samples=24, block=block)
-        assert run_experiment(RIG, plant, tmp_path / name, plan, clock=clock).ended == "complete"
+        assert run_experiment(RIG, plant, tmp_path / name, plan, clock=clock).outcome == "complete"
         with (tmp_path / name / "samples.csv").open() as file:
             return [{**row, "clock": ""} for row in csv.DictReader(file)]
 
@@ -196,7 +196,7 @@ def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
     for name in ("fast", "slow"):
         main(["design", str(tmp_path / f"{name}.toml"), "--policy", "prbs", "--samples", "16"])
         told = capsys.readouterr().err
-        assert ("there are 1.7 samples in a period; sample faster" in told) == (name == "slow")
+        assert ("the belief has 1.7 samples in a period; sample faster" in told) == (name == "slow")
     # a = 110 to 180 N/m on about 1 kg: a period of 0.5 s.
     assert design_experiment(RIG, policy="prbs", samples=16).samples_per_period == pytest.approx(26, abs=1)
 
@@ -256,7 +256,7 @@ def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
     known = load_estimator(first.folder / "estimator.npz").belief
     assert np.abs(known.state_mean[0]) > 10 * np.sqrt(known.state_cov[0, 0]), "as where an input drove it"
     last = played("next", 128, prior=known, plan={"block": block})
-    assert (last.ended, last.message) == ("complete", "")
+    assert (last.outcome, last.message) == ("complete", "")
     assert 0.5 < disturbance_std(last.belief) / RIG.input.noise < 2.0
     for name, (mean, std) in last.parameters.items():
         assert std < 1.02 * first.parameters[name][1], name
@@ -276,7 +276,7 @@ def test_a_posterior_that_the_plant_contradicts_is_told(tmp_path, block):
         said[stiffness] = run_experiment(RIG, plant, tmp_path / f"{stiffness}", plan, prior=known, clock=clock).message
     right, wrong = said.values()
     assert right == ""
-    assert "what was believed before is wrong: identify" in wrong
+    assert "the prior is wrong: identify" in wrong
 
 
 def test_the_instrument_s_table_tells_what_is_simulated(tmp_path):

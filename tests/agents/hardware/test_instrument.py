@@ -44,7 +44,7 @@ def rows(folder):
 
 def measured(folder):
     """Outputs that were measured, in time or not."""
-    return [row["y"] or row["untimely"] for row in rows(folder) if row["y"] or row["untimely"]]
+    return [row["y"] or row["late_output"] for row in rows(folder) if row["y"] or row["late_output"]]
 
 
 def play(scpi, folder, **plan):
@@ -53,7 +53,7 @@ def play(scpi, folder, **plan):
     def impatient(samples):
         """Where no answer will come, however long it is waited for."""
         if scpi.fault in ("stall", "lose") and scpi.answered == scpi.after:
-            plant._link.timeout = 50
+            plant._connection.timeout = 50
 
     plan = RunSettings(**{"policy": "prbs", "samples": 40, "listen": 8, "bound": 0.01, **plan})
     try:
@@ -77,7 +77,7 @@ def near_truth(parameters):
 
 def test_a_run_by_samples(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=160)
-    assert (result.ended, result.exit_status, result.late) == ("complete", 0, 0)
+    assert (result.outcome, result.exit_status, result.late_ticks) == ("complete", 0, 0)
     wait_for(lambda: scpi.lines[-1] == "OUTP OFF")  # the instrument reads when it comes to it
     wait_for(lambda: scpi.applied == 0.0)
     assert scpi.lines.index("WDOG 2.0") < scpi.lines.index("OUTP ON")
@@ -88,7 +88,7 @@ def test_a_run_by_samples(scpi, tmp_path):
 
 def test_a_run_by_blocks(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=128, block=64)
-    assert result.ended == "complete"
+    assert result.outcome == "complete"
     wait_for(lambda: scpi.applied == 0.0)
     assert [row["u"] for row in rows(tmp_path / "run")].count("") == 3, "a pause after each block, the silent one too"
     assert near_truth(result.parameters)
@@ -98,7 +98,7 @@ def test_a_run_by_blocks(scpi, tmp_path):
 @pytest.mark.parametrize("scpi", [{"fault": "stall"}], indirect=True)
 def test_a_sensor_that_stalls_ends_the_run(scpi, tmp_path):
     result = play(scpi, tmp_path / "run")
-    assert (result.ended, result.exit_status) == ("plant", 1)
+    assert (result.outcome, result.exit_status) == ("plant", 1)
     assert "read failed" in result.message
     assert len(measured(tmp_path / "run")) == scpi.answered == 30
     assert scpi.applied != 0.0
@@ -109,7 +109,7 @@ def test_a_sensor_that_stalls_ends_the_run(scpi, tmp_path):
 @pytest.mark.parametrize("scpi", [{"fault": "lose"}], indirect=True)
 def test_a_lost_connection_leaves_the_zero_to_the_watchdog(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", watchdog=1.0)
-    assert result.ended == "plant"
+    assert result.outcome == "plant"
     assert len(measured(tmp_path / "run")) == scpi.answered == 30
     the_watchdog_zeroes_after(scpi, 1.0)
 
@@ -117,16 +117,16 @@ def test_a_lost_connection_leaves_the_zero_to_the_watchdog(scpi, tmp_path):
 @pytest.mark.parametrize("scpi", [{"fault": "slow", "after": 20}], indirect=True)
 def test_late_samples_are_counted_marked_and_kept_from_the_estimator(scpi, tmp_path):
     result = play(scpi, tmp_path / "run", samples=200)
-    assert result.ended == "complete"
+    assert result.outcome == "complete"
     late = [row for row in rows(tmp_path / "run") if row["late"] == "1"]
-    assert len(late) == result.late >= 10
-    untimely = [row for row in late if row["untimely"]]
+    assert len(late) == result.late_ticks >= 10
+    untimely = [row for row in late if row["late_output"]]
     assert len(untimely) >= 5
     assert {row["y"] for row in untimely} == {""}
     assert all(row["u"] for row in late), "the input that stayed on is known"
     ticks = [int(row["sample"]) for row in rows(tmp_path / "run")]
     assert ticks == list(range(len(ticks)))
-    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["late"] == result.late
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["late"] == result.late_ticks
     wait_for(lambda: scpi.applied == 0.0)
 
 
@@ -203,7 +203,7 @@ def test_an_instrument_without_a_watchdog_is_not_armed(scpi, tmp_path):
         run_experiment(RIG, plant, tmp_path / "run", RunSettings(policy="prbs", samples=20), clock=scpi.clock)
     assert "OUTP ON" not in scpi.lines
     plan = RunSettings(policy="prbs", samples=20, no_watchdog=True)
-    assert run_experiment(RIG, plant, tmp_path / "run", plan, clock=scpi.clock).ended == "complete"
+    assert run_experiment(RIG, plant, tmp_path / "run", plan, clock=scpi.clock).outcome == "complete"
     plant.close()
 
 

@@ -129,10 +129,10 @@ def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_pat
     plant.fault = lambda k, y: 0.09 if k == 20 and ended == "range" else y
     setattr(plant, method, lambda: 1 / 0)
     plan = RunSettings(policy="prbs", samples=16, no_watchdog=True)
-    told = {"told": lambda samples: {}["a bug"]} if ended == "error" else {}
+    told = {"on_progress": lambda samples: {}["a bug"]} if ended == "error" else {}
     with pytest.raises(KeyError) if told else nullcontext():
         result = run_experiment(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **told)
-        assert (result.ended, result.exit_status) == (ended, 1)
+        assert (result.outcome, result.exit_status) == (ended, 1)
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["how"] == ended
     for said in (capsys.readouterr().err, manifest["message"]):
@@ -143,20 +143,20 @@ def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_pat
 def test_trips():
     plant = Bench()
     with Session(plant, RIG, nothing, 2.0, max_stale=5) as session:
-        session.check(np.array([0.08, -0.08]))
+        session.check_outputs(np.array([0.08, -0.08]))
         with pytest.raises(SafetyStop, match="beyond its range") as tripped:
-            session.check(np.array([0.01, np.nan, -0.081]))
+            session.check_outputs(np.array([0.01, np.nan, -0.081]))
         assert tripped.value.reason == "range"
-        session.check(np.full(4, np.nan))
-        session.check(np.array([0.01, 0.01, 0.01, 0.01, 0.01]))
+        session.check_outputs(np.full(4, np.nan))
+        session.check_outputs(np.array([0.01, 0.01, 0.01, 0.01, 0.01]))
         with pytest.raises(SafetyStop, match="again") as tripped:
-            session.check(np.array([0.01, np.nan]))
+            session.check_outputs(np.array([0.01, np.nan]))
         assert tripped.value.reason == "stale"
         with (
             pytest.raises(SafetyStop, match=r"^5 outputs in a row were missing$"),
             Session(plant, RIG, nothing, 2.0, max_stale=5) as other,
         ):
-            other.check(np.full(5, np.nan))
+            other.check_outputs(np.full(5, np.nan))
         plant.apply = lambda u: 4.1
         with pytest.raises(SafetyStop, match=r"applied 4\.1") as tripped:
             session.apply(1.0)
@@ -324,8 +324,8 @@ def test_signals_are_as_slow_as_the_rig():
 @table("name", ["silverbox-multisine", "multilevel-prbs", "multisine", "chirp-log", "uniform"])
 def test_signals_reach_the_rigs_limit_and_no_more(name, tmp_path):
     result = play(tmp_path / "run", policy=name, samples=64)
-    assert result.ended == "complete"
-    asked = np.array([float(row["asked"]) for row in rows(tmp_path / "run")])
+    assert result.outcome == "complete"
+    asked = np.array([float(row["commanded"]) for row in rows(tmp_path / "run")])
     share = next(event["share"] for event in events(tmp_path / "run") if event["event"] == "design")
     assert 0.05 * 4.0 < np.abs(asked).max() / share <= 4.0 * (1 + 1e-6)
 
@@ -380,7 +380,7 @@ def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
     plant = Bench()
     guess = {"m": (0.8, 1.25), "c": (-3.0, 0.5), "a": (-50.0, 180.0), "b": (-1e6, 1e5)}
     result = play(tmp_path / "run", plant, replace(RIG, guess=guess), samples=400)
-    assert (result.ended, result.exit_status) == ("design", 1)
+    assert (result.outcome, result.exit_status) == ("design", 1)
     assert not any(told[0] == "arm" for told in plant.told)
 
 
@@ -417,7 +417,7 @@ def test_blocks_leave_the_range_as_rarely_as_asked(policy):
 def test_a_run_finds_the_parameters_and_its_record_does_too(tmp_path):
     plant = Bench()
     result = play(tmp_path / "run", plant, samples=128)
-    assert (result.ended, result.late, result.exit_status, plant.applied) == ("complete", 0, 0, 0.0)
+    assert (result.outcome, result.late_ticks, result.exit_status, plant.applied) == ("complete", 0, 0, 0.0)
     found = identify(RIG, tmp_path / "run" / "samples.csv")
     for parameters in (result.parameters, found.parameters):
         assert all(abs(parameters[name][0] - TRUTH[name]) < 4.5 * parameters[name][1] for name in TRUTH)
@@ -443,14 +443,14 @@ def test_the_record_says_what_was_applied_at_which_tick(tmp_path):
 
 @pytest.mark.parametrize("options", [{}, {"block": 16}])
 def test_the_same_seed_gives_the_same_run(options, tmp_path):
-    ended = [play(tmp_path / name, **options).ended for name in "ab"]
+    ended = [play(tmp_path / name, **options).outcome for name in "ab"]
     texts = [[{**row, "clock": ""} for row in rows(tmp_path / name)] for name in "ab"]
     assert ended == ["complete"] * 2
     assert texts[0] == texts[1]
 
 
 def test_a_trained_or_answering_policy_runs_by_samples_only(tmp_path):
-    assert play(tmp_path / "run", policy="velocity-sign").ended == "complete"
+    assert play(tmp_path / "run", policy="velocity-sign").outcome == "complete"
     with pytest.raises(ValueError, match="policy must be a signal or the planner efe"):
         play(tmp_path / "other", policy="velocity-sign", block=16)
 
@@ -468,7 +468,7 @@ def test_sensors_that_fail_end_the_run_and_everything_measured_is_kept(fault, en
     plant = Bench()
     plant.fault = fault
     result = play(tmp_path / "run", plant, samples=100)
-    assert (result.ended, result.exit_status, plant.applied) == (ended, 1, 0.0)
+    assert (result.outcome, result.exit_status, plant.applied) == (ended, 1, 0.0)
     assert plant.told[-1] == ("disarm",)
     measured = plant.reads - (ended == "plant")
     assert len(rows(tmp_path / "run")) == measured
@@ -497,7 +497,7 @@ def test_a_plant_that_gives_something_else_ends_the_run_by_name(method, given, m
 
     setattr(plant, method, wrong)
     result = play(tmp_path / "run", plant, block=16 if method == "play" else None)
-    assert (result.ended, result.exit_status, plant.applied) == ("plant", 1, 0.0)
+    assert (result.outcome, result.exit_status, plant.applied) == ("plant", 1, 0.0)
     assert re.match(message, result.message)
     assert len(rows(tmp_path / "run")) >= 16
     assert {"parameters.json", "estimator.npz"} <= {path.name for path in (tmp_path / "run").iterdir()}
@@ -507,13 +507,13 @@ def test_a_plant_may_give_arrays_of_one_number(tmp_path):
     plant = Bench()
     read = plant.read
     plant.read = lambda: np.array([read()])
-    assert play(tmp_path / "run", plant, samples=8).ended == "complete"
+    assert play(tmp_path / "run", plant, samples=8).outcome == "complete"
 
 
 def test_an_output_out_of_range_before_arming_arms_nothing(tmp_path):
     plant = Bench()
     plant.fault = lambda k, y: 0.1
-    assert play(tmp_path / "run", plant).ended == "range"
+    assert play(tmp_path / "run", plant).outcome == "range"
     assert [kind for kind, *_ in plant.told] == ["disarm"]
 
 
@@ -547,10 +547,10 @@ def test_late_inputs_count_for_what_they_were(tmp_path):
 
     plant.apply = slow
     result = play(tmp_path / "run", plant, samples=200)
-    assert result.ended == "complete"
-    assert result.late == 201, "all of them, and the zero at the end"
+    assert result.outcome == "complete"
+    assert result.late_ticks == 201, "all of them, and the zero at the end"
     late = [row for row in rows(tmp_path / "run") if row["late"] == "1"]
-    applied = np.array([float(row["asked"]) for row in late])
+    applied = np.array([float(row["commanded"]) for row in late])
     np.testing.assert_allclose([float(row["u"]) for row in late[1:]], 0.6 * applied[1:] + 0.4 * applied[:-1])
     # The mean is right to first order of the lateness: 0.4² / 2 is left.
     assert all(abs(result.parameters[name][0] / TRUTH[name] - 1) < 0.08 for name in TRUTH)
@@ -574,23 +574,23 @@ def slow_to_read(steps, after=0):
 def test_a_read_that_is_too_slow_is_told_before_anything_is_armed(steps, tmp_path):
     plant = slow_to_read(steps)
     result = play(tmp_path / "run", plant)
-    assert (result.ended, result.exit_status) == ("late", 1)
+    assert (result.outcome, result.exit_status) == ("late", 1)
     assert f"came too late: read() took {20 * steps:g} ms and apply() 0 ms of a step of 20 ms; play" in result.message
-    assert result.late == len(rows(tmp_path / "run")) >= 16
+    assert result.late_ticks == len(rows(tmp_path / "run")) >= 16
     assert not any(told[0] == "arm" for told in plant.told)
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
 
 
 def test_a_read_that_hangs_while_listening_counts_as_late(tmp_path):
     result = play(tmp_path / "run", slow_to_read(400, after=3))
-    assert (result.ended, result.late) == ("late", 400)
+    assert (result.outcome, result.late_ticks) == ("late", 400)
 
 
 @pytest.mark.parametrize("steps", [0.4, 3])
 def test_a_read_that_becomes_slow_ends_the_run_as_a_dead_sensor_does(steps, tmp_path):
     plant = slow_to_read(steps, after=16)
     result = play(tmp_path / "run", plant, samples=128)
-    assert (result.ended, result.exit_status, plant.applied) == ("late", 1, 0.0)
+    assert (result.outcome, result.exit_status, plant.applied) == ("late", 1, 0.0)
     assert result.message.startswith("32 outputs in a row came too late")
 
 
@@ -598,9 +598,9 @@ def test_a_run_that_left_its_range_tells_of_the_ticks_that_it_missed(tmp_path):
     plant = slow_to_read(3, after=16)
     plant.fault = lambda k, y: 0.09 if k == 24 else y
     result = play(tmp_path / "run", plant, samples=128, stale=0)
-    assert (result.ended, plant.applied) == ("range", 0.0)
-    assert result.late > 0
-    assert f"beyond its range of ±0.08; {result.late} ticks of the clock were missed before" in result.message
+    assert (result.outcome, plant.applied) == ("range", 0.0)
+    assert result.late_ticks > 0
+    assert f"beyond its range of ±0.08; {result.late_ticks} ticks of the clock were missed before" in result.message
 
 
 def test_a_simulated_plant_has_some_noise_where_its_rig_states_none():
@@ -611,7 +611,7 @@ def test_a_simulated_plant_has_some_noise_where_its_rig_states_none():
 
 def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
     result = play(tmp_path / "run", slow_to_read(3, after=16), samples=128, stale=0)
-    assert (result.ended, result.exit_status, result.late) == ("complete", 0, 132)
+    assert (result.outcome, result.exit_status, result.late_ticks) == ("complete", 0, 132)
     assert result.message.startswith(
         "132 of 148 outputs came too late to be used: intervals may be too narrow; play blocks"
     )
@@ -634,9 +634,9 @@ def test_every_warning_is_told_whatever_ended_the_run(ended, tmp_path):
 
     plan = RunSettings(policy="prbs", samples=160, stale=0)
     result = run_experiment(RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, on_progress=told)
-    assert result.ended == ended
+    assert result.outcome == ended
     assert "outputs came too late to be used: intervals may be too narrow" in result.message
-    assert "what was believed before is wrong: identify" in result.message
+    assert "the prior is wrong: identify" in result.message
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
 
 
@@ -644,10 +644,10 @@ def test_a_run_without_any_output_ends_in_order(tmp_path):
     plant = Bench()
     plant.fault = lambda k, y: 1 / 0
     result = play(tmp_path / "run", plant)
-    assert (result.ended, result.message) == ("plant", "read failed: ZeroDivisionError: division by zero")
+    assert (result.outcome, result.message) == ("plant", "read failed: ZeroDivisionError: division by zero")
     plant = Bench()
     plant.fault = lambda k, y: math.nan
-    assert play(tmp_path / "other", plant, samples=100, stale=0).ended == "complete"
+    assert play(tmp_path / "other", plant, samples=100, stale=0).outcome == "complete"
 
 
 def test_the_folder_of_another_run_is_left_alone(tmp_path):
@@ -695,8 +695,8 @@ def test_a_simulated_plant_does_not_catch_up_with_what_went_by_before_it_was_dri
     """What a run needs to load and to plan does not make its first ticks late."""
     clock = JumpingClock()
     plant = SimulatedPlant(RIG, TRUTH, clock=clock)
-    moved, move = [], plant._runge_kutta
-    plant._runge_kutta = lambda h: (moved.append(h), move(h))
+    moved, move = [], plant._rk4_step
+    plant._rk4_step = lambda h: (moved.append(h), move(h))
     clock.wait(5.0)
     plant.read()
     assert not moved
