@@ -1,4 +1,4 @@
-"""``duffing-env train``: a policy that chooses the input."""
+"""``duffing-env train``: train a policy that chooses the input, resume it, or search for hyperparameters."""
 
 import shlex
 import sys
@@ -13,7 +13,7 @@ from agents.console_output import print_warning, print_wrapped
 from agents.interruption import add_resume_hint
 from agents.training import ALGORITHMS, TrainConfig, TrainingSubject, resume, train, train_seeds, tune_hyperparameters
 from agents.training.environments.oscillator_family import FAMILY
-from agents.training.training_run import LEARNING_CURVE_FILE, UNTRAINED_FOLDER
+from agents.training.run_folder import LEARNING_CURVE_FILE, UNTRAINED_FOLDER
 from estimator.support.argument_checks import check_integer
 
 TRAIN_HELP = """Train a policy that chooses the input, and compare it with the reference policies.
@@ -30,10 +30,10 @@ $ duffing-env train --seeds 5 --ray                    five seeds, on a cluster
 $ duffing-env train --resume runs/ppo-amplitude-v0-0   go on after a stop
 """
 
-#: How several trainings go on: each of them alone would be finished without the others.
+#: Hint after several trainings were stopped: --resume would finish one of them alone.
 _REPEAT_COMMAND_HINT = "the same command goes on with what is left"
 
-#: Updates that teach too little to make up for what exploring unlearns.
+#: Fewest updates without a warning: after fewer a policy may be worse than an untrained one.
 _MIN_UPDATES = 4
 
 
@@ -42,7 +42,7 @@ class TrainCommand(TrainConfig):
     """Train a policy, and compare it."""
 
     resume: Path | None = None
-    """Run folder to go on with after it was stopped; it has its settings in it, so none are taken here."""
+    """Run folder to go on with after a stop; the run has its own settings, so no others are given here."""
     tune: int = 0
     """Trials of a search for hyperparameters, instead of a training; the same command goes on with a search."""
     seeds: int = 1
@@ -64,7 +64,7 @@ class TrainCommand(TrainConfig):
             raise ValueError(f"systems must be 0 or at least 2, but is {self.systems}; intervals need more than one")
 
     def run(self) -> None:
-        """Train, compare, and say where everything is."""
+        """Train or search, compare, and print where the files are."""
         each = self.hyperparameters.samples_per_update
         if self.resume is None and self.samples > self.steps:
             print_wrapped(
@@ -74,7 +74,7 @@ class TrainCommand(TrainConfig):
             message = f"a training of {updates} update{'s' * (updates > 1)} may leave a policy worse than it began"
             print_warning(f"{message}; take more steps than {self.steps:,}")
         if self.tune:
-            with add_resume_hint(lambda said: _REPEAT_COMMAND_HINT):
+            with add_resume_hint(lambda hint: _REPEAT_COMMAND_HINT):
                 best = tune_hyperparameters(self, self.tune, on_ray=self.ray)
             print_wrapped(f"The best hyperparameters are in {best}")
             quoted_path = shlex.quote(str(best))
@@ -83,7 +83,7 @@ class TrainCommand(TrainConfig):
             )
             return
         if self.seeds > 1:
-            with add_resume_hint(lambda said: _REPEAT_COMMAND_HINT):
+            with add_resume_hint(lambda hint: _REPEAT_COMMAND_HINT):
                 for folder in train_seeds(self, self.seeds, on_ray=self.ray):
                     print_wrapped(f"The run is in {folder}")
                     sys.stdout.flush()
@@ -103,7 +103,7 @@ class TrainCommand(TrainConfig):
             print_wrapped("No episode ended, so there is no learning curve; take more steps.")
 
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
-        """Compare what was trained with the usual policies."""
+        """Compare what was trained with the default policies of the track."""
         if config.env == FAMILY:
             module = "research.studies.unseen_oscillators"
             print_wrapped(f"From a checkout of the repository: python -m {module} --policies {policy}")
@@ -118,7 +118,7 @@ class TrainCommand(TrainConfig):
 
 
 def default_train_command(arguments: list[str] | None) -> TrainCommand:
-    """The defaults of the algorithm and the track that the words name, its hyperparameters under its name."""
+    """The defaults for the algorithm and the track in the arguments, with its hyperparameters under its name."""
     subject, _ = tyro.cli(TrainingSubject, args=arguments, add_help=False, return_unknown_args=True)
     settings_class, name = ALGORITHMS[subject.algo], tyro.conf.arg(name=subject.algo.replace("_", "-"))
 
@@ -136,11 +136,11 @@ def main(program_name: str, arguments: list[str] | None = None) -> None:
     """Run the command.
 
     Args:
-        program_name: that it is called by.
-        arguments: its arguments; those of this process where they are None.
+        program_name: stands before messages.
+        arguments: of the command; None: the arguments of this process.
 
     Raises:
-        SystemExit: as `agents.commands.main`.
+        SystemExit: as of `agents.commands.main`.
     """
     with one_line_errors(program_name):
         defaults = default_train_command(arguments)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from agents.evaluation.policy_evaluation import Evaluation
     from agents.hardware.next_experiment import ExperimentDesign
+    from agents.training.checkpoints import LearningPoint
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _LINE_STYLES = ("-", "--", ":")
@@ -48,7 +49,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def plot_learning_curve(
-    curve: list[tuple[int, float, float]], reward: str, held_out: Sequence[tuple[int, float]] = ()
+    curve: Sequence[LearningPoint], reward: str, held_out: Sequence[tuple[int, float]] = ()
 ) -> Figure:
     """Mean return of the last episodes over the samples that were trained on, with wall time above.
 

@@ -1,4 +1,4 @@
-"""Training: any algorithm on any registered track, into a run folder that can rebuild itself and be resumed."""
+"""Training of policies by PPO, SAC, TD3, TQC or recurrent PPO on any track, in run folders that can be resumed."""
 
 from agents.training.algorithms import (
     ALGORITHMS,
@@ -12,7 +12,8 @@ from agents.training.algorithms import (
 from agents.training.hyperparameter_search import tune_hyperparameters
 from agents.training.seed_runs import train_seeds
 from agents.training.training_config import TrainConfig, TrainingSubject
-from agents.training.training_run import TrainingRun, resume, train
+from agents.training.training_loop import TrainingRun
+from agents.training.training_run import resume, train
 
 __all__ = [
     "ALGORITHMS",

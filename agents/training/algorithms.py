@@ -1,7 +1,7 @@
-"""The algorithms: their hyperparameters, the model that these make, and where a search for better ones looks.
+"""Hyperparameters of PPO, recurrent PPO, SAC, TD3 and TQC: defaults, search ranges, and the models that they make.
 
-The defaults suit a batched environment, where a sample is cheap and a gradient step is not: many environments, large
-batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has what differs from them on a track.
+The defaults are for batched environments, where a sample is cheap and a gradient step is not: many environments, large
+batches, few gradient steps. `agents/hyperparameters/ALGORITHM.toml` has the values that differ on a track.
 """
 
 from __future__ import annotations
@@ -15,14 +15,18 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
 
-# Hyperparameters by what they may be; whole numbers that are not named here are at least 1.
+#: Hyperparameters from 0 on; other whole numbers are at least 1.
 _NON_NEGATIVE = ("learning_starts", "exploration_noise", "dropped_quantiles", "levels", "entropy_bonus")
+
+#: Hyperparameters above 0.
 _POSITIVE = ("learning_rate", "entropy_weight")
+
+#: Hyperparameters from 0 to 1.
 _FRACTIONS = ("gamma", "gae_lambda", "tau")
 
 
 def _with_search_range(default: Any, low: Any, high: Any, **sampling: Any) -> Any:
-    """A hyperparameter that a search varies: its default, its range, and how Optuna is to draw from that."""
+    """A hyperparameter that a search varies: its default, its range, and arguments of Optuna's ``suggest``."""
     return field(default=default, metadata={"low": low, "high": high, **sampling})
 
 
@@ -41,11 +45,11 @@ class AlgorithmSettings(ABC):
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of actor and critic."""
     activation: Literal["relu", "tanh", "elu"] = "relu"
-    """What stands between the layers."""
+    """Activation between the layers."""
     features: bool = True
-    """Whether the network sees features of the observation, and a shield bounds its input (docs/training.md)."""
+    """Whether the network gets features of the observation, and a shield bounds its input (docs/training.md)."""
     own: bool = True
-    """Whether it sees the observation itself, too; on the family it never does."""
+    """Whether the network gets the observation itself, too; on the family it never does."""
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -83,7 +87,7 @@ class AlgorithmSettings(ABC):
         return {f.name: suggest[type(f.default)](f.name, **f.metadata) for f in searched_fields}
 
     def _model_arguments(self, envs: VecEnv, seed: int, *names: str) -> dict[str, Any]:
-        """Arguments that every model takes, and those of the hyperparameters that are named."""
+        """Arguments of every model, and the named hyperparameters."""
         initial_rate = self.learning_rate
         return {name: getattr(self, name) for name in names} | {
             "env": envs,
@@ -99,7 +103,7 @@ class AlgorithmSettings(ABC):
 
 @dataclass(frozen=True)
 class OnPolicySettings(AlgorithmSettings):
-    """Hyperparameters of algorithms that learn from the samples of the present policy only."""
+    """Hyperparameters of on-policy algorithms, which learn from the samples of the present policy only."""
 
     n_steps: int = _with_search_range(64, 16, 128, step=16)
     """Samples that each environment collects between two updates."""
@@ -108,22 +112,22 @@ class OnPolicySettings(AlgorithmSettings):
     gae_lambda: float = _with_search_range(0.95, 0.85, 1.0)
     """Trade-off of bias and variance in the advantage (generalised advantage estimation)."""
     log_std_init: float = _with_search_range(-0.5, -1.5, 0.0)
-    """Log standard deviation of the action at the start, where it is not one of some levels."""
+    """Log standard deviation of the action at the start; not used with levels."""
     entropy_bonus: float = 0.0
     """Weight of the action's entropy at the start; it falls linearly to 0."""
     levels: int = 0
-    """Evenly spaced inputs from one limit to the other that the policy chooses from; 0 for all between."""
+    """Number of evenly spaced inputs from one limit to the other to choose from; 0: all inputs between."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.levels == 1:
-            raise ValueError("levels must be 0 or at least 2, but is 1; there is nothing to choose from one")
+            raise ValueError("levels must be 0 or at least 2, but is 1; a single input leaves no choice")
         if self.batch_size == 1 or self.num_envs * self.n_steps == 1:
             raise ValueError("batch_size and num_envs * n_steps must be at least 2; PPO normalises over a batch")
 
     @property
     def samples_per_update(self) -> int:
-        """The roll-out."""
+        """Samples of a roll-out."""
         return self.num_envs * self.n_steps
 
     @property
@@ -140,10 +144,10 @@ class OnPolicySettings(AlgorithmSettings):
 
 @dataclass(frozen=True)
 class PPOSettings(OnPolicySettings):
-    """Hyperparameters of PPO; chosen for a batched environment: large batches, few epochs."""
+    """Hyperparameters of PPO for batched environments: large batches, few epochs."""
 
     advantages_by_time: bool = True
-    """Whether advantages of features count alike at every time of an episode (`agents.training.timed_advantages`)."""
+    """Whether advantages are normalised at every time of an episode alike (`agents.training.timed_advantages`)."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """Stable-Baselines3's PPO."""
@@ -159,7 +163,7 @@ class PPOSettings(OnPolicySettings):
 
 @dataclass(frozen=True)
 class RecurrentPPOSettings(OnPolicySettings):
-    """Hyperparameters of PPO with a memory; fewer environments, because a gradient step follows whole sequences."""
+    """Hyperparameters of PPO with an LSTM; fewer environments, because a gradient step goes through sequences."""
 
     num_envs: int = 128
     """Environments that are stepped together."""
@@ -179,14 +183,14 @@ class RecurrentPPOSettings(OnPolicySettings):
 
 @dataclass(frozen=True)
 class OffPolicySettings(AlgorithmSettings):
-    """Hyperparameters of algorithms that learn from a buffer of past samples."""
+    """Hyperparameters of off-policy algorithms, which learn from a replay buffer."""
 
     num_envs: int = 64
     """Environments that are stepped together."""
     batch_size: int = _with_search_range(256, 128, 1024, log=True)
     """Samples of a gradient step."""
     buffer_size: int = 200_000
-    """Samples that are kept, over all environments."""
+    """Samples in the replay buffer, over all environments."""
     learning_starts: int = 5_000
     """Samples with random inputs at the start, over all environments."""
     train_freq: int = 4
@@ -194,16 +198,16 @@ class OffPolicySettings(AlgorithmSettings):
     gradient_steps: int = _with_search_range(32, 8, 64, log=True)
     """Gradient steps in an update."""
     tau: float = _with_search_range(0.005, 2e-3, 2e-2, log=True)
-    """How far the target networks follow in a gradient step."""
+    """Rate at which the target networks follow, per gradient step."""
 
     @property
     def samples_per_update(self) -> int:
-        """What is put into the buffer before the next gradient steps."""
+        """Samples that are put into the buffer between two updates."""
         return self.num_envs * self.train_freq
 
     @property
     def log_interval(self) -> int:
-        """About every time that all environments have ended an episode."""
+        """About once per episode of all environments."""
         return self.num_envs
 
     def _off_policy_arguments(self, envs: VecEnv, seed: int) -> dict[str, Any]:
@@ -227,10 +231,10 @@ class SACSettings(OffPolicySettings):
 
 @dataclass(frozen=True)
 class TQCSettings(SACSettings):
-    """Hyperparameters of TQC: SAC with critics of the return's distribution, without its upper end."""
+    """Hyperparameters of TQC: SAC with distributional critics, whose upper quantiles are dropped."""
 
     dropped_quantiles: int = _with_search_range(2, 0, 5)
-    """Upper quantiles of 25 that each critic drops, against overestimation."""
+    """Number of upper quantiles, of 25, that each critic drops against overestimation."""
 
     def make(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """sb3-contrib's TQC."""
@@ -272,12 +276,12 @@ ALGORITHMS: dict[str, type[AlgorithmSettings]] = {
 
 
 def _activation_class(activation: str) -> Any:
-    """The activation as torch has it."""
+    """The class of an activation in torch."""
     from torch import nn
 
     return {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU}[activation]
 
 
 def hyperparameters_to_dict(settings: AlgorithmSettings) -> dict[str, Any]:
-    """Hyperparameters as JSON and TOML hold them."""
+    """Hyperparameters as values of JSON and TOML."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(settings).items()}

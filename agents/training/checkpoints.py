@@ -1,8 +1,8 @@
-"""Checkpoints: the policy on the way, and in the latest one the state of the training, from which it goes on.
+"""Checkpoints of a training: the policy so far, and in the latest one the whole state, from which a run resumes.
 
-The state is ``training.safetensors`` (weights, moments of the optimisers, the replay buffer where there is one, and the
-moment that the training is in: episodes, streams of random numbers, and the last returns) and ``training.json`` (the
-counts). With it a training that goes on from a checkpoint is the one that was never stopped, bit for bit.
+The state is ``training.safetensors`` (weights, moments of the optimisers, the replay buffer where there is one, and
+between two roll-outs: episodes, streams of random numbers, and the last returns) and ``training.json`` (the counts).
+A training that goes on from a checkpoint equals the training without a stop, bit for bit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections import deque
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -26,49 +26,98 @@ from estimator.support.file_io import check_readable_file, explain_write_errors,
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
 
+    from agents.training.environments.feature_vec_env import FeatureNormalizer
+
+#: Name to array, as a safetensors file holds them.
 TensorDict = dict[str, npt.NDArray[Any]]
 
+#: Folder of the checkpoints, in a run folder.
 CHECKPOINTS_FOLDER = "checkpoints"
+
+#: Counts of a training, in its latest checkpoint.
 STATE_FILE = "training.json"
+
+#: Arrays of a training, in its latest checkpoint.
 TENSORS_FILE = "training.safetensors"
+
+#: Begins the name of a checkpoint that is being written.
 _PARTIAL_PREFIX = ".checkpoint-"
-_LOG_ENTROPY_WEIGHT = "log_ent_coef"  # the log weight of the entropy, of an algorithm that learns it
+
+#: Attribute of an algorithm that learns the weight of the entropy: the logarithm of this weight.
+_LOG_ENTROPY_WEIGHT = "log_ent_coef"
+
+#: Arrays of a replay buffer.
 _BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+#: Return, length and time of an episode, as Stable-Baselines3 names them.
 _EPISODE_KEYS = ("r", "l", "t")
+
+#: Tensors of the normaliser in a policy's file.
 _NORMALIZER_TENSORS = ("normalizer.mean", "normalizer.std")
+
+
+@runtime_checkable
+class _NormalizedEnvs(Protocol):
+    """Environments with normalised features."""
+
+    normalizer: FeatureNormalizer
+
+
+@runtime_checkable
+class _ResumableEnvs(Protocol):
+    """Environments whose episodes can be saved and restored."""
+
+    @property
+    def episode_state(self) -> TensorDict: ...
+    def restore_episode_state(self, memory: TensorDict) -> VecEnvObs: ...
+
+
+class LearningPoint(NamedTuple):
+    """A point of a learning curve.
+
+    Attributes:
+        steps: samples so far.
+        seconds: of wall time so far.
+        mean_return: of the last episodes; None where no episode has ended.
+    """
+
+    steps: int
+    seconds: float
+    mean_return: float | None
 
 
 @dataclass
 class TrainingProgress:
-    """How far a training is: what ``training.json`` holds.
+    """Counts of a training, the content of ``training.json``.
 
     Attributes:
         steps: samples so far.
         updates: gradient updates so far, as the algorithm counts them.
         episodes: episodes so far, as the algorithm counts them.
         seconds: of wall time so far.
-        curve: (updates, 3) samples, seconds, mean return of the last episodes; None where none has ended.
+        curve: a point for every update.
     """
 
     steps: int = 0
     updates: int = 0
     episodes: int = 0
     seconds: float = 0.0
-    curve: list[tuple[int, float, float | None]] = field(default_factory=list)
+    curve: list[LearningPoint] = field(default_factory=list)
 
 
 def save_checkpoint(
     run_folder: Path, model: BaseAlgorithm, card: dict[str, Any], progress: TrainingProgress | None
 ) -> None:
-    """Write ``checkpoints/STEPS`` in one piece: under another name first, which is changed when all of it is there.
+    """Write ``checkpoints/STEPS`` in one piece: under another name first, and renamed when it is complete.
 
     Args:
         run_folder: the run folder.
         model: the algorithm.
         card: of the policy, see `save_policy`.
-        progress: of a training that is to go on from here; older checkpoints then lose their state. None: the policy
-            alone.
+        progress: of a training that can go on from here; older checkpoints then lose their state. None: the checkpoint
+            holds the policy alone.
     """
     target = run_folder / CHECKPOINTS_FOLDER / f"{model.num_timesteps:09d}"
     with explain_write_errors(target):
@@ -88,23 +137,23 @@ def save_checkpoint(
 
 
 def latest_checkpoint(run_folder: Path) -> Path | None:
-    """The latest checkpoint that a training can go on from; those that were never finished are removed."""
+    """The latest checkpoint with the state of the training, or None; partly written checkpoints are removed."""
     for partial in run_folder.glob(f"{_PARTIAL_PREFIX}*"):
         shutil.rmtree(partial)
     return max((state.parent for state in run_folder.glob(f"{CHECKPOINTS_FOLDER}/*/{STATE_FILE}")), default=None)
 
 
 def load_progress(checkpoint: Path) -> TrainingProgress:
-    """How far the training was.
+    """The counts of the training at a checkpoint.
 
     Raises:
-        ValueError: where the file is damaged.
+        ValueError: for a damaged file.
     """
     try:
         content = json.loads(
             check_readable_file(checkpoint / STATE_FILE, "checkpoint must be whole", 2**28).read_text(encoding="utf-8")
         )
-        return TrainingProgress(**{**content, "curve": [tuple(point) for point in content["curve"]]})
+        return TrainingProgress(**{**content, "curve": [LearningPoint(*point) for point in content["curve"]]})
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"checkpoint must hold a sound {STATE_FILE}, but {checkpoint} does not: {error!r}") from error
 
@@ -113,7 +162,7 @@ def load_initial_network(policy_folder: Path, model: BaseAlgorithm) -> None:
     """Give a new model the network of a trained policy.
 
     Raises:
-        ValueError: where it holds no policy, or that of another network.
+        ValueError: for a folder without a policy, or a policy with another network.
     """
     import torch
     from safetensors.numpy import load_file
@@ -133,27 +182,28 @@ def load_initial_network(policy_folder: Path, model: BaseAlgorithm) -> None:
         if shapes.get(name) != model_shapes.get(name):
             raise ValueError(
                 f"begin must be a policy with the network of the training, but {policy_folder} has {name} of shape "
-                f"{shapes.get(name, 'none')} in place of {model_shapes.get(name, 'none')}; train with its hyperparameters"
+                f"{shapes.get(name, 'none')} in place of {model_shapes.get(name, 'none')}; "
+                f"train with its hyperparameters"
             )
     model.policy.load_state_dict(tensors)
     _copy_normalizer(policy_folder, model)
 
 
 def _copy_normalizer(policy_folder: Path, model: BaseAlgorithm) -> None:
-    """Let the environments of a model normalise features as those of a policy did; nothing where it has none."""
+    """Give the environments of a model the normaliser of a policy, where both have one."""
     from safetensors.numpy import load_file
 
-    envs: Any = model.get_env()
+    envs = model.get_env()
     tensors = load_file(policy_folder / WEIGHTS_FILE)
-    if hasattr(envs, "normalizer") and _NORMALIZER_TENSORS[0] in tensors:
+    if isinstance(envs, _NormalizedEnvs) and _NORMALIZER_TENSORS[0] in tensors:
         envs.normalizer.mean, envs.normalizer.std = (tensors[name].copy() for name in _NORMALIZER_TENSORS)
 
 
 def restore_training_state(checkpoint: Path, model: BaseAlgorithm) -> None:
-    """Give a new model the weights, moments, buffer, counts and episodes that the checkpoint holds.
+    """Give a new model the weights, moments, buffer, counts and episodes of a checkpoint.
 
     Raises:
-        ValueError: where the tensors are damaged or those of another model.
+        ValueError: for tensors that are damaged or belong to another model.
     """
     import torch
     from safetensors import SafetensorError
@@ -163,7 +213,7 @@ def restore_training_state(checkpoint: Path, model: BaseAlgorithm) -> None:
     model.num_timesteps, model._n_updates = progress.steps, progress.updates
     model._episode_num = progress.episodes
     try:
-        _copy_normalizer(checkpoint, model)  # which a run that was begun with a policy has from that
+        _copy_normalizer(checkpoint, model)  # a run that began with a policy has the normaliser of this policy
         tensors = {name: tensor.copy() for name, tensor in load_file(checkpoint / TENSORS_FILE).items()}
         for name in model.get_parameters():
             component = attrgetter(name)(model)
@@ -185,7 +235,7 @@ def restore_training_state(checkpoint: Path, model: BaseAlgorithm) -> None:
 
 
 def delete_training_states(run_folder: Path, keep: Path | None = None) -> None:
-    """Remove the state from all checkpoints but one; their policies stay."""
+    """Remove the state of the training from all checkpoints but ``keep``; their policies stay."""
     for state in run_folder.glob(f"{CHECKPOINTS_FOLDER}/*/{STATE_FILE}"):
         if state.parent != keep:
             state.unlink()
@@ -218,7 +268,7 @@ def _save_training_state(folder: Path, model: BaseAlgorithm, progress: TrainingP
 
 
 def _optimizer_state(tensors: dict[str, Any], optimizer: Any) -> dict[str, Any]:
-    """The state of an optimiser, from its tensors "PARAMETER/MOMENT"; its settings are those of the model."""
+    """The state of an optimiser from its tensors "PARAMETER/MOMENT", with the settings of the model."""
     state: dict[int, dict[str, Any]] = {}
     for key, value in tensors.items():
         index, moment = key.split("/")
@@ -235,11 +285,11 @@ def _restore_replay_buffer(buffer: Any, tensors: TensorDict) -> None:
 
 
 def capture_rollout_state(model: BaseAlgorithm) -> TensorDict:
-    """The moment between an update and the next roll-out; nothing where the environments cannot be gone on with."""
+    """The state between an update and the next roll-out; empty where the environments cannot be restored."""
     import torch
 
-    envs: Any = model.get_env()
-    if not hasattr(envs, "restore_episode_state"):
+    envs = model.get_env()
+    if not isinstance(envs, _ResumableEnvs):
         return {}
     numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002  Stable-Baselines3 draws from it
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
@@ -257,16 +307,17 @@ def capture_rollout_state(model: BaseAlgorithm) -> TensorDict:
 
 
 def restore_rollout_state(model: BaseAlgorithm, rollout_state: TensorDict) -> None:
-    """Put a model with new environments into the moment that another was in.
+    """Put a model with new environments into the state that `capture_rollout_state` returned.
 
     Raises:
-        KeyError, ValueError: where it is that of a model with other environments.
+        KeyError, ValueError: for the state of a model with other environments.
     """
     import torch
 
     if not rollout_state:
         return
-    envs: Any = model.get_env()
+    envs = model.get_env()
+    assert isinstance(envs, _ResumableEnvs)
     model._last_obs = envs.restore_episode_state(tensors_with_prefix(rollout_state, "envs"))
     model._last_episode_starts = rollout_state["starts"]
     model._current_progress_remaining = float(rollout_state["left"])
@@ -282,11 +333,11 @@ def restore_rollout_state(model: BaseAlgorithm, rollout_state: TensorDict) -> No
 
 
 def tensors_with_prefix(tensors: TensorDict, prefix: str) -> TensorDict:
-    """What is called "NAME/KEY", by its key."""
+    """The tensors "PREFIX/KEY", by their keys."""
     return {key.removeprefix(f"{prefix}/"): array for key, array in tensors.items() if key.startswith(f"{prefix}/")}
 
 
 def _lstm_states(model: Any) -> list[Any]:
-    """The memories (layers, n, units) of actor and critic, of a model that has one."""
+    """The LSTM states (layers, n, units) of actor and critic; empty for a model without LSTM."""
     states = getattr(model, "_last_lstm_states", None)
     return [] if states is None else [value for part in states for value in part]

@@ -1,4 +1,4 @@
-"""What a policy is worth on the way: by the metrics of `evaluate.py`, on systems of the branch ``validation``."""
+"""Evaluation during a training, on held-out systems: the metrics of `evaluate.py` on the branch ``validation``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import json
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agents.evaluation.policy_evaluation import run_episodes
 from agents.policies.networks.policy_saving import write_policy
@@ -19,30 +19,52 @@ if TYPE_CHECKING:
 
     from agents.training.training_config import TrainConfig
 
-#: The metrics, each the mean over the systems; the score is what policies are ranked by.
-HELDOUT_METRICS = ("information_gain", "log_posterior_gain", "coverage", "ended_early")
+
+class HeldOutScores(NamedTuple):
+    """Metrics of a policy, each the mean over the held-out systems.
+
+    Attributes:
+        information_gain: [nats].
+        log_posterior_gain: gain of the posterior's log density at the truth [nats]; policies are ranked by it.
+        coverage: fraction of the 90 % credible intervals that hold the truth.
+        ended_early: fraction of the episodes that a limit ended.
+    """
+
+    information_gain: float
+    log_posterior_gain: float
+    coverage: float
+    ended_early: float
+
+
+#: Name of the metric by which policies are ranked.
 HELDOUT_SCORE = "log_posterior_gain"
 
+#: Table of the evaluations, in a run folder.
 EVALUATIONS_FILE = "evaluations.csv"
+
+#: Folder of the policy with the best score so far, in a run folder.
 BEST_POLICY_FOLDER = "best"
 
+#: Held-out systems of an evaluation.
 _N_SYSTEMS = 128
+
+#: Seed of these systems and their noise.
 _SEED = 0
 
 
 def final_score(folder: Path) -> float:
-    """The score of a finished run, which was evaluated at its end."""
+    """The score of a finished run at its end."""
     *_, last = csv.DictReader((folder / EVALUATIONS_FILE).read_text(encoding="utf-8").splitlines())
     return float(last[HELDOUT_SCORE])
 
 
 class HeldOutEvaluator:
-    """Evaluations on the same systems throughout, in ``evaluations.csv``; the best policy so far is in ``best/``.
+    """Evaluates policies on the same systems, and writes ``evaluations.csv`` and the best policy so far, ``best/``.
 
     Args:
         folder: the run folder.
         config: of the run.
-        first_step: samples that the training goes on from; rows beyond them are dropped.
+        first_step: samples from which the training goes on; rows of more samples are dropped.
     """
 
     def __init__(self, folder: Path, config: TrainConfig, first_step: int = 0) -> None:
@@ -53,10 +75,8 @@ class HeldOutEvaluator:
                 if int(row["steps"]) <= first_step:
                     self._rows.append({name: int(v) if name == "steps" else float(v) for name, v in row.items()})
         self._best = float("-inf")
-        if (folder / BEST_POLICY_FOLDER / CARD_FILE).exists():
-            self._best = json.loads((folder / BEST_POLICY_FOLDER / CARD_FILE).read_text(encoding="utf-8"))[
-                "evaluation"
-            ][HELDOUT_SCORE]
+        if (card_file := folder / BEST_POLICY_FOLDER / CARD_FILE).exists():
+            self._best = json.loads(card_file.read_text(encoding="utf-8"))["evaluation"][HELDOUT_SCORE]
 
     @property
     def has_begun(self) -> bool:
@@ -70,32 +90,29 @@ class HeldOutEvaluator:
 
     @property
     def information_gains(self) -> list[tuple[int, float]]:
-        """Samples, and the information [nats] that was gained then, of every evaluation."""
+        """Samples and information gain [nats] of every evaluation."""
         return [(int(row["steps"]), row["information_gain"]) for row in self._rows]
 
-    def evaluate(self, model: BaseAlgorithm, card: dict[str, Any]) -> dict[str, float]:
-        """Evaluate a model by the mean of its policy, as it would be saved; write the row, and a policy that is best.
+    def evaluate(self, model: BaseAlgorithm, card: dict[str, Any]) -> HeldOutScores:
+        """Evaluate the mean action of a model, write the row, and save the policy if it is the best so far.
 
         Args:
             model: the algorithm.
             card: of the policy, see `save_policy`.
-
-        Returns:
-            `HELDOUT_METRICS`.
         """
         with tempfile.TemporaryDirectory() as candidate:
             write_policy(Path(candidate), model, card)
             options = self._config.options | {"branch": "validation"}
             evaluation, *_ = run_episodes(candidate, self._config.env, _N_SYSTEMS, _SEED, options)
-        scores = {name: float(evaluation.metrics[name].mean()) for name in HELDOUT_METRICS}
-        self._rows.append({"steps": model.num_timesteps, **scores})
+        scores = HeldOutScores(*(float(evaluation.metrics[name].mean()) for name in HeldOutScores._fields))
+        self._rows.append({"steps": model.num_timesteps, **scores._asdict()})
         table = io.StringIO()
-        writer = csv.DictWriter(table, ["steps", *HELDOUT_METRICS], lineterminator="\n")
+        writer = csv.DictWriter(table, ["steps", *HeldOutScores._fields], lineterminator="\n")
         writer.writeheader()
         writer.writerows(self._rows)
         write_atomically(self._folder / EVALUATIONS_FILE, table.getvalue())
-        if scores[HELDOUT_SCORE] > self._best:
-            self._best = scores[HELDOUT_SCORE]
-            best_card = card | {"evaluation": {"seed": _SEED, "systems": _N_SYSTEMS, **scores}}
+        if scores.log_posterior_gain > self._best:
+            self._best = scores.log_posterior_gain
+            best_card = card | {"evaluation": {"seed": _SEED, "systems": _N_SYSTEMS, **scores._asdict()}}
             write_policy(self._folder / BEST_POLICY_FOLDER, model, best_card)
         return scores

@@ -1,4 +1,4 @@
-"""Files of hyperparameters: TOML, one table for each track, and one for all that have none."""
+"""Hyperparameter files in TOML: a table for each track, and a default table for the others."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from agents.training.environments.oscillator_family import FAMILY
 from estimator.support.argument_checks import check_choice, did_you_mean, mask_control_codes
 from estimator.support.file_io import check_readable_file, write_atomically
 
-#: Folder of the files that come with the package, ``ALGORITHM.toml``.
+#: Folder of the files ``ALGORITHM.toml`` that come with the package.
 HYPERPARAMETER_FOLDER = Path(__file__).parents[1] / "hyperparameters"
+
+#: Table of the tracks without a table of their own.
 DEFAULT_TABLE = "default"
 
 _TYPE_NAMES: dict[type, str] = {
@@ -31,21 +33,21 @@ def track_name(env_id: str) -> str:
 
 
 def table_name(env_id: str) -> str:
-    """The name of a track's table, which all its versions share: "Amplitude"; of what has no versions its own."""
+    """The name of a track's table, which all its versions share, such as "Amplitude"; else its own name."""
     return track_name(env_id).rpartition("-v")[0] or env_id
 
 
 def read_hyperparameters(algo: str, env_id: str, path: Path | None = None) -> AlgorithmSettings:
-    """The hyperparameters of an algorithm on a track: its defaults, the table "default", the table of the track.
+    """The hyperparameters of an algorithm on a track: its defaults, overridden by the default and the track's table.
 
     Args:
         algo: a name in `ALGORITHMS`.
         env_id: of the track.
-        path: of the file; the package's where it is not given.
+        path: of the file; None: the package's file.
 
     Raises:
-        ValueError: for an unknown algorithm, or a file that is not TOML, or has an entry that is no hyperparameter, or,
-            but for the package's, no table for the track.
+        ValueError: for an unknown algorithm, a file that is not TOML or has an entry that is no hyperparameter, or a
+            file of your own that has no table for the track.
         OSError: where the file cannot be read.
     """
     check_choice("algo", algo, ALGORITHMS)
@@ -67,10 +69,10 @@ def read_hyperparameters(algo: str, env_id: str, path: Path | None = None) -> Al
 
 
 def parse_hyperparameters(settings_class: type[Settings], entries: Mapping[str, Any]) -> Settings:
-    """Hyperparameters of this kind from entries as JSON and TOML hold them.
+    """Hyperparameters from the entries of a JSON or TOML file.
 
     Raises:
-        ValueError: for an entry that is not a field, or whose value has another type.
+        ValueError: for an entry that is no hyperparameter, or a value of another type.
     """
     defaults: dict[str, Any] = {f.name: getattr(settings_class(), f.name) for f in fields(settings_class)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
@@ -96,7 +98,7 @@ def write_hyperparameters(path: Path, env_id: str, settings: AlgorithmSettings, 
 
 
 def _check_hyperparameter_table(table: str, entries: Any, settings_class: type[AlgorithmSettings], path: Path) -> None:
-    """Refuse a table of no registered track, and bad entries also in the tables that are not asked for."""
+    """Refuse a table of no registered track, and bad entries in any table."""
     from gymnasium import registry
 
     import duffing_env  # noqa: F401  registers the tracks
@@ -109,7 +111,8 @@ def _check_hyperparameter_table(table: str, entries: Any, settings_class: type[A
             *dict.fromkeys(table_name(name) for name in registry if name.startswith("duffing_env/")),
         ]
         raise ValueError(
-            f"settings must have tables [{DEFAULT_TABLE}] or of tracks, but {path} has [{table}]{did_you_mean(table, known_tables)}"
+            f"settings must have tables [{DEFAULT_TABLE}] or of tracks, but {path} has [{table}]"
+            f"{did_you_mean(table, known_tables)}"
         )
     try:
         parse_hyperparameters(settings_class, entries)

@@ -1,8 +1,9 @@
-"""Imitation: the networks of a model learn what another policy decides and is worth, before they learn by reward.
+"""Imitation learning (DAgger) of another policy by actor and critic, before a training by reward.
 
-DAgger (Ross, Gordon and Bagnell 2011): in every other environment the teacher's own action is taken, in the others the
-student's, and the teacher says everywhere what it would do. So the student also sees where its own mistakes lead. The
-critic learns the returns of the episodes that end meanwhile: one that knows nothing would unlearn the actor.
+DAgger (Ross, Gordon and Bagnell 2011): in every other environment the teacher's action is played, in the others the
+student's, and the teacher's action is the target everywhere. So the data hold the states after the student's own
+mistakes, too. The critic learns the returns of the episodes that end meanwhile: with an untrained critic, PPO's first
+updates would destroy the actor.
 """
 
 from __future__ import annotations
@@ -17,25 +18,31 @@ import numpy.typing as npt
 from agents.policies import make_policy
 from agents.training.environments.feature_vec_env import FeatureVecEnv
 
-#: Samples between two fits, in each environment; passes over all decisions so far in a fit; decisions of a step.
-_SAMPLES_BETWEEN_FITS, _EPOCHS_PER_FIT, _BATCH_SIZE = 64, 4, 1024
+#: Samples of each environment between two fits.
+_SAMPLES_BETWEEN_FITS = 64
 
-#: Step size of the fits.
+#: Passes of a fit over all samples so far.
+_EPOCHS_PER_FIT = 4
+
+#: Samples of a gradient step.
+_BATCH_SIZE = 1024
+
+#: Learning rate of the fits.
 _LEARNING_RATE = 1e-3
 
 
 def imitate_policy(
     model: Any, envs: FeatureVecEnv, teacher: str, samples: int, seed: int, on_progress: Callable[[float], None]
 ) -> None:
-    """Let the actor of a model of Stable-Baselines3's PPO choose as another policy does, and its critic know the worth.
+    """Fit the actor of a Stable-Baselines3 PPO model to another policy's actions, and the critic to the returns.
 
     Args:
-        model: to teach.
+        model: whose networks are fitted.
         envs: its environments, which are stepped; the next `learn` begins new episodes.
         teacher: a policy's name, as of `agents.make_policy`.
-        samples: decisions to learn from, over all environments.
-        seed: of the teacher's randomness, and of the order of the decisions.
-        on_progress: called with the share that is done.
+        samples: to learn from, over all environments.
+        seed: of the teacher, and of the order of the samples.
+        on_progress: called with the fraction that is done.
     """
     import torch
 
@@ -74,7 +81,7 @@ def imitate_policy(
 def discounted_returns(
     rewards: npt.NDArray[Any], episode_ends: npt.NDArray[np.bool_], discount: float
 ) -> npt.NDArray[np.float32]:
-    """Discounted returns (T, n) from every sample to the end of its episode; NaN where that has not come.
+    """Discounted returns (T, n) from every sample to the end of its episode; NaN where the episode has not ended.
 
     Example:
         >>> rewards, ends = np.ones((4, 1), np.float32), np.array([[False], [True], [False], [False]])
@@ -91,7 +98,7 @@ def discounted_returns(
 
 
 def _network_actions(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """What the network would have to choose for these actions: upright, as its action space has it."""
+    """The network's actions, in its own action space and mirrored to the upright frame, for these actions."""
     features = envs.current_features
     max_actions = np.maximum(features.action_scales, 1e-6)
     mirrored = np.clip(actions[:, 0] * features.mirror_signs / max_actions, -1.0, 1.0)
@@ -101,7 +108,7 @@ def _network_actions(envs: FeatureVecEnv, actions: npt.NDArray[Any]) -> npt.NDAr
 
 
 def _minimise_loss(batch_loss: Callable[[Any], Any], n_samples: int, optimizer: Any, generator: Any) -> None:
-    """Step down a loss of batches of so many rows, given by their places."""
+    """Minimise a loss over batches of row indices by gradient steps."""
     import torch
 
     for _ in range(_EPOCHS_PER_FIT):
@@ -113,7 +120,7 @@ def _minimise_loss(batch_loss: Callable[[Any], Any], n_samples: int, optimizer: 
 
 
 def _fit_actor(policy: Any, optimizer: Any, observations: Any, teacher_actions: Any, generator: Any) -> None:
-    """Raise the likelihood of the teacher's choices."""
+    """Maximise the likelihood of the teacher's actions."""
     import torch
 
     observations, teacher_actions = torch.from_numpy(observations), torch.from_numpy(teacher_actions)
@@ -122,7 +129,7 @@ def _fit_actor(policy: Any, optimizer: Any, observations: Any, teacher_actions: 
 
 
 def _fit_critic(policy: Any, optimizer: Any, observations: Any, returns: Any, generator: Any) -> None:
-    """Lower the squared error of the critic."""
+    """Minimise the squared error of the critic."""
     import torch
 
     observations, returns = torch.from_numpy(observations), torch.from_numpy(returns)

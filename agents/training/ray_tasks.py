@@ -1,4 +1,4 @@
-"""Work on a Ray cluster: pieces in processes of their own, on whatever node has room."""
+"""Tasks on a Ray cluster, each in a process of its own, restarted when its process or node dies."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from itertools import islice
 from typing import Any, TypeVar
 
 Task = TypeVar("Task")
+TaskResult = TypeVar("TaskResult")
 
 
-def run_on_ray(work: Callable[[Task], Any], tasks: Iterable[Task]) -> Iterator[tuple[Task, Any]]:
-    """Tasks and what the work made of them, in the order in which they are finished.
+def run_on_ray(work: Callable[[Task], TaskResult], tasks: Iterable[Task]) -> Iterator[tuple[Task, TaskResult]]:
+    """Yield tasks and their results, in the order in which they are finished.
 
-    The cluster is that of ``RAY_ADDRESS``, else one of this machine's own, which ends with the work. A task is begun
-    anew on another node, as often as needed, when its process or its node dies; so the work must go on with what it
-    finds. As many tasks are under way as the cluster has processors; the next is taken when one is finished.
+    The cluster is at ``RAY_ADDRESS``, else on this machine alone and ended with the work. When its process or its node
+    dies, a task is restarted on another node, as often as needed: so ``work`` must go on from the files that it finds.
+    As many tasks run at once as the cluster has processors; the next task is taken when one is finished.
 
     Raises:
-        Exception: what a task raises; the others are then ended, too.
+        Exception: of a task; the others are then ended, too.
     """
     import ray
 

@@ -1,4 +1,4 @@
-"""Several trainings of one recipe, which differ by their seeds: one after the other, or on a Ray cluster."""
+"""Trainings of one configuration with several seeds, one after the other or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from estimator.support.optional_dependencies import require_packages
 
 
 def train_seeds(config: TrainConfig, seeds: int, *, on_ray: bool = False) -> Iterator[Path]:
-    """Train with a seed and those after it, each into a run folder of its own; tells each that is finished.
+    """Train with consecutive seeds, each into a run folder of its own; yields each folder when its run is finished.
 
-    The folders are ``OUTPUT/SEED``, where the output is runs/ALGO-TRACK if none is named. What an earlier call left
-    there is gone on with, or is finished. The weights do not depend on where a seed is trained, nor on how often it was
-    stopped.
+    The folders are ``OUTPUT/SEED``; without an output, runs/ALGO-TRACK/SEED. Runs of an earlier call go on from their
+    checkpoints, and finished ones stay. The weights depend neither on the machine nor on how often a run was stopped.
 
     Args:
-        config: of the first.
-        seeds: how many.
-        on_ray: whether they are tasks on a cluster, see `agents.training.ray_tasks`; all its nodes must see the folder.
+        config: of the first seed.
+        seeds: number of seeds.
+        on_ray: whether they are tasks on a cluster, see `agents.training.ray_tasks`; all nodes must have access to the
+            folder.
 
     Raises:
-        ModuleNotFoundError: without Ray, where it is asked for.
+        ModuleNotFoundError: without Ray, if ``on_ray``.
         ValueError: where a folder holds another run.
     """
     if on_ray:

@@ -1,4 +1,4 @@
-"""Advantages of PPO that count alike at every time of an episode."""
+"""A roll-out buffer for PPO that normalises advantages separately in each part of an episode."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from agents.policies.networks.feature_names import FEATURE_NAMES
 
 _TIME_LEFT_INDEX = FEATURE_NAMES.index("time_left")
 
-#: Stretches of time that advantages are normalised in; standard deviations that are kept at most.
-_N_TIME_BINS, _MAX_ADVANTAGE = 16, 4.0
+#: Bins of time, in each of which advantages are normalised.
+_N_TIME_BINS = 16
+
+#: Largest advantage after the normalisation [standard deviations]; larger ones are clipped.
+_MAX_ADVANTAGE = 4.0
 
 
 class TimeNormalisedRolloutBuffer(RolloutBuffer):
-    """A buffer of features whose advantages have mean 0 and standard deviation 1 in each of 16 stretches of time.
+    """A buffer of features whose advantages have mean 0 and standard deviation 1 in each of 16 bins of time.
 
-    Early in an episode the noises become known, which moves returns by nats, whatever was done; later on, decisions
-    move them by hundredths. Normalised over a whole roll-out, the first would drown the others.
+    Early in an episode the noises become known, which changes returns by nats, whatever the actions; later, actions
+    change returns by hundredths. A normalisation over the whole roll-out would make these later advantages negligible.
     """
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray[Any, Any]) -> None:
-        """As of the base class; returns stay as they are."""
+        """As of the base class, then normalise the advantages; the returns stay as they are."""
         super().compute_returns_and_advantage(last_values, dones)
         order = np.argsort(-self.observations[..., _TIME_LEFT_INDEX], axis=None, kind="stable")
         advantages = self.advantages.reshape(-1)

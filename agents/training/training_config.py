@@ -1,4 +1,4 @@
-"""What a training run is made from: its configuration, and how the run folder tells it."""
+"""Configuration of a training run: algorithm, track, reward, steps and hyperparameters, and its file config.json."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from estimator.support.argument_checks import check_choice, check_integer, check
 from estimator.support.file_io import check_readable_file
 from estimator.support.optional_dependencies import require_packages
 
-#: Rewards that count information.
+#: Rewards whose sum is information [nats].
 INFORMATION_REWARDS = ("information_gain", "log_posterior", "fisher", "expected_free_energy")
 
 
 @dataclass(frozen=True)
 class TrainingSubject:
-    """What is trained on what; the hyperparameters follow from it, where they are not given."""
+    """Algorithm and track of a training, from which the default hyperparameters follow."""
 
     algo: Literal["ppo", "sac", "td3", "tqc", "recurrent_ppo"] = "ppo"
     """Algorithm."""
     env: str = "duffing_env/Amplitude-v0"
-    """Track, such as Short-v0; or family, oscillators of all kinds."""
+    """Track, such as Short-v0; or family: random oscillators of all kinds."""
     rig: str | None = None
     """Rig file, or the name of a rig that ships; the track is then Rig-v0."""
     settings: Path | None = None
-    """File of hyperparameters, TOML; the one that comes with the package where it is not given."""
+    """TOML file of hyperparameters; the package's file where it is not given."""
 
     def __post_init__(self) -> None:
         if self.rig is not None and full_track_id(self.env) not in (TrainingSubject.env, RIG_TRACK):
@@ -47,10 +47,10 @@ class TrainingSubject:
 
 @dataclass(frozen=True)
 class TrainConfig(TrainingSubject):
-    """What a training run is made from. Written to ``config.json`` of its folder."""
+    """Configuration of a training run, which is written to ``config.json`` of its folder."""
 
     reward: str = "information_gain"
-    """Name of the reward, such as information_gain, log_posterior or fisher (`duffing_env.rewards.reward_registry` has all)."""
+    """Name of the reward, such as information_gain, log_posterior or fisher."""
     steps: int = 5_000_000
     """Samples to learn from, over all environments."""
     seed: int = 0
@@ -58,25 +58,25 @@ class TrainConfig(TrainingSubject):
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
     vary: JsonOptions = field(default_factory=dict)
-    """Options that are drawn anew for every episode, as JSON: a name, and the lowest and highest value."""
+    """Options that are drawn for every episode, as JSON: name to lowest and highest value."""
     output: Path | None = None
     """Run folder; runs/ALGO-TRACK-SEED where it is not given, with a number where that exists."""
     begin: Path | None = None
-    """Policy folder whose network to begin with, of the same shape; else it begins at random."""
+    """Policy folder with the initial network, of the same shape; random weights where it is not given."""
     imitate: str | None = None
-    """Policy whose decisions the network learns before it learns by reward, such as efe; with ppo alone."""
+    """Policy that the network imitates before it learns by reward, such as efe; with ppo alone."""
     imitations: int = 200_000
-    """Of these decisions, over all environments."""
+    """Samples of the imitation, over all environments."""
     checkpoints: int = 5
     """Checkpoints over the run, evenly spaced."""
     eval_every: int = 0
     """Samples between evaluations on systems held out from training; 0 for none."""
     tensorboard: bool = False
-    """Whether to write the log for TensorBoard, too."""
+    """Whether to write a log for TensorBoard, too."""
     torch_threads: int = 1
-    """Threads of torch; it moves the last digits. More than one gain little, and lose much on a busy machine."""
+    """Threads of torch; several change the last digits, gain little, and lose much on a busy machine."""
     hyperparameters: AlgorithmSettings = field(default=None)  # type: ignore[assignment]
-    """Hyperparameters; those that the file has for the track where they are not given."""
+    """Hyperparameters; by the file's table for the track where they are not given."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,7 +85,7 @@ class TrainConfig(TrainingSubject):
             check_track_id(self.env)
         check_mapping("options", self.options)
         check_env_options(self.options)
-        # A run has its rig in itself, and not the name of a file that may change.
+        # The options hold the rig itself, because its file may change.
         object.__setattr__(self, "options", options_with_rig(self.options, self.rig))
         object.__setattr__(self, "rig", None)
         upper_bounds = {
@@ -101,9 +101,11 @@ class TrainConfig(TrainingSubject):
         if self.tensorboard:
             require_packages("tensorboard")
         if "reward" in self.options:
-            raise ValueError(f"options must not hold reward, but are {self.options}; reward has a place of its own")
+            raise ValueError(f"options must not hold reward, but are {self.options}; give it as reward")
         if "branch" in self.options:
-            raise ValueError(f"options must not hold branch, but are {self.options}; the others are to compare on")
+            raise ValueError(
+                f"options must not hold branch, but are {self.options}; the other branches are for comparison"
+            )
         if self.env != FAMILY:
             check_track_id(self.env)
         elif self.options or self.eval_every or self.algo != "ppo":
@@ -132,13 +134,13 @@ class TrainConfig(TrainingSubject):
 
     @property
     def samples(self) -> int:
-        """Samples that are learned from: ``steps``, up to a whole number of updates."""
+        """Number of samples of the training: ``steps``, rounded up to a whole number of updates."""
         per_update = self.hyperparameters.samples_per_update
         return -(-self.steps // per_update) * per_update
 
 
 def _check_observation(config: TrainConfig) -> None:
-    """Refuse an observation that has no features."""
+    """Refuse an observation without features."""
     observation = {**env_spec_of(config.env).kwargs, **config.options}.get("observation", "posterior")
     if observation != "posterior":
         raise ValueError(
@@ -148,7 +150,7 @@ def _check_observation(config: TrainConfig) -> None:
 
 
 def _check_imitation(config: TrainConfig) -> None:
-    """Refuse what cannot learn from another policy's decisions."""
+    """Refuse a configuration that cannot imitate a policy."""
     if config.algo != "ppo" or not config.hyperparameters.features or config.env == FAMILY or config.vary:
         raise ValueError(
             f"imitate needs ppo with features on one track, but algo is {config.algo}, features "
@@ -159,12 +161,11 @@ def _check_imitation(config: TrainConfig) -> None:
 
 
 def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
-    """What is varied, each from the lowest to the highest value."""
+    """The range of each varied option, checked."""
     check_mapping("vary", config.vary)
     if config.env == FAMILY or not config.hyperparameters.features or config.reward not in INFORMATION_REWARDS:
         raise ValueError(
-            f"vary needs a track, features and a reward that counts information ({', '.join(INFORMATION_REWARDS)}), but env is "
-            f"{config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
+            f"vary needs a track, features and a reward of {', '.join(INFORMATION_REWARDS)}, but env is {config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
         )
     if (num_envs := config.hyperparameters.num_envs) % LANES:
         raise ValueError(
@@ -176,13 +177,14 @@ def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
         bounds = list(bounds) if isinstance(bounds, list | tuple) else [bounds]
         if len(bounds) != 2 or not all(is_finite_number(end) for end in bounds) or not 0 < bounds[0] <= bounds[1]:
             raise ValueError(
-                f"vary[{name!r}] must be two positive numbers, the lower one first, but is {short_repr(config.vary[name])}"
+                f"vary[{name!r}] must be two positive numbers, the lower one first, but is "
+                f"{short_repr(config.vary[name])}"
             )
     return {name: list(ends) for name, ends in config.vary.items()}
 
 
 def describe_run(config: TrainConfig) -> dict[str, Any]:
-    """What a run was made from: the resolved configuration, the command and the versions."""
+    """The content of config.json: the resolved configuration, the command and the versions."""
     resolved = asdict(config) | {"hyperparameters": hyperparameters_to_dict(config.hyperparameters)}
     resolved = {name: str(value) if isinstance(value, Path) else value for name, value in resolved.items()}
     return {
@@ -193,13 +195,13 @@ def describe_run(config: TrainConfig) -> dict[str, Any]:
 
 
 def claim_run_folder(config_file: Path, config: TrainConfig) -> None:
-    """Write what something in the folder of a file is made from; a folder that holds another is refused.
+    """Write the configuration into a folder, or check that the folder holds the same one.
 
-    Where the folder lies is not looked at: it may have been moved since, and what to begin with beside it. The file
-    then tells where they are now.
+    The location of the folder does not count: it may have been moved, together with the initial policy beside it. The
+    file then gets the present locations.
 
     Raises:
-        ValueError: for a file that says something else, naming the first setting that differs.
+        ValueError: for a folder with another configuration, naming the first setting that differs.
     """
     described = json.loads(json.dumps(describe_run(config)))
     old_content = json.loads(config_file.read_text(encoding="utf-8")) if config_file.exists() else described
@@ -215,7 +217,7 @@ def claim_run_folder(config_file: Path, config: TrainConfig) -> None:
 
 
 def _comparable_settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a configuration as JSON has it, each hyperparameter by itself, paths as seen from the output."""
+    """Settings of a config.json, each hyperparameter by itself, and paths relative to the output."""
     settings = {name: config.get(name) for name in (f.name for f in fields(TrainConfig)) if name != "output"}
     if config.get("output") and settings["begin"]:
         settings["begin"] = os.path.relpath(settings["begin"], config["output"])
@@ -224,12 +226,16 @@ def _comparable_settings(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def contrib_packages(config: TrainConfig) -> tuple[str, ...]:
-    """sb3-contrib, where the algorithm is of it."""
+    """The package of algorithms beyond Stable-Baselines3, where this one needs it."""
     return ("sb3_contrib",) if config.algo in ("tqc", "recurrent_ppo") else ()
 
 
 def read_config(folder: Path) -> TrainConfig:
-    """The configuration that a run folder was made from; what only a script had in it is left out."""
+    """The configuration of a run folder; settings of a command alone are left out.
+
+    Raises:
+        ValueError: for a config.json that is damaged, or of a version with other settings.
+    """
     try:
         config_file = check_readable_file(
             folder / CONFIG_FILE, "resume must be a run folder, with a config.json", 2**20

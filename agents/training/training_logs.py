@@ -1,4 +1,4 @@
-"""What follows a training from within Stable-Baselines3: its loop's callback, and its log."""
+"""Callback and logs of a training with Stable-Baselines3: progress.csv that can be resumed, and TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoard
 
 from estimator.support.file_io import explain_write_errors
 
+#: Column of the samples so far, in progress.csv.
 _STEPS_COLUMN = "time/total_timesteps"
 
 
 class TrainingCallback(BaseCallback):
-    """Reports every roll-out, and every update that follows one.
+    """Calls functions after every step, every roll-out, and the update that follows it.
 
     Args:
         on_rollout: called with the samples so far and the mean return of the last episodes, before the update.
         on_update: called after the update.
         on_step: called with the samples so far, after every step of the environments.
-        entropy_bonus: of the algorithm at the start, where it is to fall linearly to 0; 0 leaves it as it is.
+        entropy_bonus: weight of the entropy at the start, which falls linearly to 0; 0: the algorithm's own weight.
     """
 
     def __init__(
@@ -63,12 +64,12 @@ class TrainingCallback(BaseCallback):
 
 
 class WallTimeLogger(Logger):
-    """Stable-Baselines3's log, with seconds of the clock that nobody sets, in place of its own.
+    """Stable-Baselines3's logger with the seconds of a monotonic clock.
 
     Args:
         folder: of the files.
-        formats: that write them.
-        first_step: samples that the training goes on from.
+        formats: writers of the files.
+        first_step: samples from which the training goes on.
     """
 
     def __init__(self, folder: Path, formats: list[Any], first_step: int) -> None:
@@ -76,7 +77,7 @@ class WallTimeLogger(Logger):
         self._start_time, self._steps = time.perf_counter(), first_step
 
     def dump(self, step: int = 0) -> None:
-        """Write what was recorded."""
+        """Write the recorded values."""
         if "time/time_elapsed" in self.name_to_value:
             seconds = max(time.perf_counter() - self._start_time, 1e-9)
             self.name_to_value["time/time_elapsed"] = int(seconds)
@@ -85,7 +86,7 @@ class WallTimeLogger(Logger):
 
 
 class TensorBoardLog(TensorBoardOutputFormat):
-    """TensorBoard's log; an error names its folder."""
+    """TensorBoard's log; an error of the disk names its folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -98,20 +99,20 @@ class TensorBoardLog(TensorBoardOutputFormat):
             super().write(*row)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the rest, and close."""
         with explain_write_errors(self._folder):
             super().close()
 
 
 class ResumedCSVLog(CSVOutputFormat):
-    """A log that goes on after its rows up to ``first_step``; what is there already is never lost, as it replaces the file.
+    """progress.csv with its rows up to ``first_step``, to which new rows are added; the file is replaced in one piece.
 
     Args:
         path: of the CSV file; it need not exist.
-        first_step: samples that the training goes on from.
+        first_step: samples from which the training goes on.
 
     Raises:
-        OSError: naming the file, where it cannot be written, as `write` and `close`.
+        OSError: naming the file, where it cannot be written, as of `write` and `close`.
     """
 
     def __init__(self, path: Path, first_step: int) -> None:
@@ -144,6 +145,6 @@ class ResumedCSVLog(CSVOutputFormat):
 
 
 def _is_complete_row_until(header: str, line: str, steps: int) -> bool:
-    """Whether a row is whole, and of a sample up to ``first_step``."""
+    """Whether a row is complete, and of at most this number of samples."""
     (row,) = csv.DictReader([header, line])
     return None not in row.values() and None not in row and int(row[_STEPS_COLUMN] or steps + 1) <= steps

@@ -24,11 +24,12 @@ from estimator import Rig
 ROOT = Path(__file__).parents[2]
 #: Where the options of each script are declared: file and class.
 DECLARED = {
-    "train.py": [("agents/commands/train_command.py", "Config", ""), ("agents/training/training_config.py", "Subject", ""),
+    "train.py": [("agents/commands/train_command.py", "TrainCommand", ""),
+                 ("agents/training/training_config.py", "TrainingSubject", ""),
                  ("agents/training/training_config.py", "TrainConfig", ""),
                  ("agents/training/algorithms.py", "AlgorithmSettings", "ppo."),
                  ("agents/training/algorithms.py", "OnPolicySettings", "ppo.")],
-    "evaluate.py": [("agents/commands/evaluate_command.py", "Evaluate", "")],
+    "evaluate.py": [("agents/commands/evaluate_command.py", "EvaluateCommand", "")],
 }  # fmt: skip
 
 

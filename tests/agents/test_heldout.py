@@ -10,7 +10,7 @@ import pytest
 from agents import make_policy
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.training import PPOSettings, TrainConfig, train
-from agents.training.heldout_evaluation import HELDOUT_METRICS
+from agents.training.heldout_evaluation import HeldOutScores
 
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,), learning_rate=0.01)
 ENV = "duffing_env/Short-v0"
@@ -36,8 +36,8 @@ def run(tmp_path_factory):
 def test_evaluations_are_told_and_written(run):
     made, told = run
     assert [steps for steps, _ in told] == [0, 256, 512]  # before all updates, and the first after 200 and 400 samples
-    assert rows(made.folder) == [{"steps": steps, **found} for steps, found in told]
-    assert set(told[0][1]) == set(HELDOUT_METRICS)
+    assert rows(made.folder) == [{"steps": steps, **found._asdict()} for steps, found in told]
+    assert isinstance(told[0][1], HeldOutScores)
     assert told[0] != told[1]
 
 
@@ -47,16 +47,16 @@ def test_they_are_the_metrics_of_evaluate(run):
     told_of = best["evaluation"]
     options = {"branch": "validation"}
     (evaluation,) = evaluate_policies([str(made.folder)], ENV, told_of["systems"], told_of["seed"], options)
-    for name in HELDOUT_METRICS:
-        assert evaluation.metrics[name].mean() == pytest.approx(told[-1][1][name], rel=1e-12), name
+    for name in HeldOutScores._fields:
+        assert evaluation.metrics[name].mean() == pytest.approx(getattr(told[-1][1], name), rel=1e-12), name
 
 
 def test_the_best_policy_is_kept(run):
     made, told = run
-    steps, found = max(told, key=lambda entry: entry[1]["log_posterior_gain"])
+    steps, found = max(told, key=lambda entry: entry[1].log_posterior_gain)
     card = make_policy(str(made.folder / "best")).card
     assert card["steps"] == steps
-    assert {name: card["evaluation"][name] for name in HELDOUT_METRICS} == found
+    assert {name: card["evaluation"][name] for name in HeldOutScores._fields} == found._asdict()
 
 
 def test_evaluating_does_not_move_the_training(run, tmp_path):
@@ -79,7 +79,7 @@ def test_tensorboard_holds_both_logs(tmp_path):
     made = train(tiny(tmp_path / "run", eval_every=256, tensorboard=True))
     (events,) = Path(made.folder).glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
-    for name in HELDOUT_METRICS:
+    for name in HeldOutScores._fields:
         scalars = accumulator.Scalars(f"evaluation/{name}")
         assert [scalar.step for scalar in scalars] == [0, 256, 512]
         np.testing.assert_allclose([s.value for s in scalars], [row[name] for row in rows(made.folder)], rtol=1e-6)

@@ -9,7 +9,7 @@ from tables import table
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.environments.feature_vec_env import REWARD_SCALE
 from agents.training.environments.mixed_vec_env import MixedVecEnv, draw_track_options
-from agents.training.environments.oscillator_family import draw_rig_track
+from agents.training.environments.training_envs import draw_family_options
 from estimator.compilation.simd import LANES
 
 TRACK = "duffing_env/Power-v0"
@@ -67,7 +67,7 @@ def test_an_episode_adds_up_to_what_it_gained(track):
     envs.close()
 
 
-@pytest.mark.parametrize("draw", [DRAW, draw_rig_track], ids=["track", "family"])
+@pytest.mark.parametrize("draw", [DRAW, draw_family_options], ids=["track", "family"])
 def test_the_same_seed_gives_the_same_episodes(draw):
     def episodes(seed):
         envs = MixedVecEnv(LANES, seed, draw)

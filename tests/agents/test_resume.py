@@ -314,8 +314,8 @@ def test_after_a_signal_the_update_is_finished_and_all_is_kept(tmp_path, number,
 @pytest.mark.parametrize(
     ("where", "left"),
     [
-        ("_make_training_envs", "nothing was kept"),
-        ("_TrainingLoop._learn", "nothing was kept; begin again with: duffing-env train"),
+        ("environments.training_envs.make_training_envs", "nothing was kept"),
+        ("training_loop.TrainingLoop._learn", "nothing was kept; begin again with: duffing-env train"),
     ],
 )
 def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, monkeypatch, where, left):
@@ -324,7 +324,7 @@ def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, mon
         def stop(*arguments, error=error):
             raise error
 
-        monkeypatch.setattr(f"agents.training.training_run.{where}", stop)
+        monkeypatch.setattr(f"agents.training.{where}", stop)
         folder = tmp_path / f"run-{number}"
         with pytest.raises(Interrupted) as caught:
             train(config("ppo", folder))
@@ -334,7 +334,7 @@ def test_a_stop_before_the_first_update_says_that_nothing_was_kept(tmp_path, mon
 
 def test_a_stop_before_the_first_update_of_a_resumed_run_says_how_to_go_on(run_of_400, monkeypatch):
     monkeypatch.setattr(
-        "agents.training.training_run._TrainingLoop._learn", lambda self: signal.raise_signal(signal.SIGINT)
+        "agents.training.training_loop.TrainingLoop._learn", lambda self: signal.raise_signal(signal.SIGINT)
     )
     with pytest.raises(Interrupted) as caught:
         resume(run_of_400)

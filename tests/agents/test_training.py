@@ -24,9 +24,9 @@ from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.result_files import write_json
 from agents.training import PPOSettings, TrainConfig, resume, train
+from agents.training.environments.training_envs import make_training_envs
 from agents.training.hyperparameters import parse_hyperparameters
 from agents.training.training_config import describe_run
-from agents.training.training_run import _make_training_envs
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SMALL = PPOSettings(num_envs=64, n_steps=64, batch_size=1024, hidden=(16,))
@@ -165,7 +165,7 @@ def test_no_training_meets_a_system_that_policies_are_compared_on():
         return envs.truth.m
 
     for seed in range(3):
-        envs = _make_training_envs(TrainConfig(env="duffing_env/Short-v0", seed=seed, hyperparameters=SMALL), seed)
+        envs = make_training_envs(TrainConfig(env="duffing_env/Short-v0", seed=seed, hyperparameters=SMALL), seed)
         envs.reset()
         met = {*envs.envs.truth.m.tolist()}
         if seed == 0:

@@ -1,4 +1,4 @@
-"""Environments as a network with features sees them: `agents.policies.networks.rollout_features` in place of observations."""
+"""A `VecEnv` whose observations are normalised features (`agents.policies.networks.rollout_features`)."""
 
 from __future__ import annotations
 
@@ -13,36 +13,37 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from agents.policies.networks.feature_encoder import FeatureEncoder, ShieldedFeatures
 from agents.policies.networks.feature_names import MAX_FEATURE
 from agents.sb3_vec_env import DuffingVecEnv
+from duffing_env.vector_env import DuffingVectorEnv
 
-#: Rewards are scaled to returns of about 1, where a critic begins.
+#: Factor of all rewards: returns are then about 1, as a new critic expects.
 REWARD_SCALE = 5.0
 
-#: No feature is taken to vary by less, so that one that is constant in the training says nothing when it changes.
+#: Smallest standard deviation of a feature: a feature that is constant in the training then has little effect later.
 _MIN_STD = 0.05
 
 
-def has_shaping_potential(envs: Any) -> bool:
-    """Whether Ψ is what is still to come in unwrapped environments (`FeatureVecEnv`)."""
+def has_shaping_potential(envs: DuffingVectorEnv) -> bool:
+    """Whether `FeatureVecEnv` shapes rewards here: the belief forgets nothing, and the energy is not limited."""
     setup = envs.experiment.kernel_params
     return not setup.has_drift and setup.budget == np.inf
 
 
 class FeatureNormalizer:
-    """Features with mean 0 and standard deviation 1, where random choices are played; as they are before `fit`."""
+    """Scales features to mean 0 and standard deviation 1 under random actions; the identity before `fit`."""
 
     def __init__(self, n_features: int) -> None:
         self.mean, self.std = np.zeros(n_features, np.float32), np.ones(n_features, np.float32)
 
     def __call__(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Normalised features, at most `BOUND` in size."""
+        """Normalised features, clipped to ± `MAX_FEATURE`."""
         return np.clip((values - self.mean) / self.std, -np.float32(MAX_FEATURE), np.float32(MAX_FEATURE))
 
     def to_tensors(self) -> dict[str, npt.NDArray[Any]]:
-        """By the names that a policy's file has them under."""
+        """Mean and standard deviation, by their names in a policy's file."""
         return {"normalizer.mean": self.mean, "normalizer.std": self.std}
 
     def fit(self, envs: VecEnv, samples: int, seed: int) -> None:
-        """Play random choices in environments whose features are as they are, for so many samples, and close them."""
+        """Play random actions for a number of samples in environments without normaliser, and close them."""
         rng, space = np.random.default_rng(seed), envs.action_space
         observations: list[Any] = [envs.reset()]
         for _ in range(samples):
@@ -60,23 +61,25 @@ class FeatureNormalizer:
 class FeatureVecEnv(VecEnvWrapper):
     """A `DuffingVecEnv` whose observations are normalised features, and whose actions the shield bounds.
 
-    Rewards tell early what they are worth at the end: to each comes the increase of Ψ = ½ log det(I + C J), with C the
-    covariance of the belief's coefficients and J the information that the rest of the episode will bring at the rate
-    of a swing at the limit; Ψ is 0 when the episode has ended. It is a difference of potentials, so without a discount
-    no policy gains by it (Ng, Harada and Russell 1999). But without it most information is gained in the first samples
-    of an episode, whatever the input, and the rest weighs little. Where the energy is limited no swing at the limit is
-    kept up, and where the belief forgets nothing is known for good: there rewards stay as they are.
+    Reward shaping (Ng, Harada and Russell 1999): each reward is raised by the increase of the potential
+    Ψ = ½ log det(I + C J), with C the covariance of the belief's coefficients, and J the information of the rest of the
+    episode at the rate of an oscillation at the limit; Ψ is 0 at the end of the episode. Without a discount the optimal
+    policy stays the same. Without shaping most reward comes in the first samples of an episode, whatever the input.
+    Rewards are not shaped where the energy is limited, because an oscillation at the limit cannot be kept up, and
+    where the belief forgets, because information is lost.
 
-    The end of an episode is an end, by time too: there is nothing to gain after it, and the features show it coming.
-
-    Attributes:
-        observations: what the environments show now.
+    The time limit is a terminal state: there is no reward after it, and the features hold the time that is left.
 
     Args:
-        venv: the environments, with any input between the limits as an action.
-        raw_observation: whether the observation itself stands behind the features.
+        venv: the environments, whose actions are all inputs between the limits.
+        raw_observation: whether the observation follows the features.
         levels: as of `DuffingVecEnv`.
-        reward_in_nats: whether the reward counts information, so that Ψ is added to it.
+        reward_in_nats: whether the reward is information, so that it is shaped by Ψ.
+
+    Attributes:
+        features: description of the features, as a policy's card holds it.
+        normalizer: of the features.
+        raw_observations: the last observations of the environments.
     """
 
     def __init__(
@@ -89,27 +92,33 @@ class FeatureVecEnv(VecEnvWrapper):
         self._discrete_actions = np.linspace(-1.0, 1.0, levels) if levels else None
         space = gym.spaces.Box(-MAX_FEATURE, MAX_FEATURE, (self._feature_map.size,), np.float32)
         super().__init__(venv, space, gym.spaces.Discrete(levels) if levels else venv.action_space)
+        self._duffing_envs = venv
 
     @property
     def tensors(self) -> dict[str, npt.NDArray[Any]]:
-        """Setting and normaliser, as a policy's file holds them."""
+        """Setting and normaliser, by their names in a policy's file."""
         return {"setting": self._feature_map.to_tensor(), **self.normalizer.to_tensors()}
 
     @property
     def current_features(self) -> ShieldedFeatures:
-        """What the environments show now, not normalised."""
+        """The features of the last observations, not normalised."""
         return self._current_features
 
     def reset(self) -> VecEnvObs:
         """Start an episode in every row."""
         return self._to_features(self.venv.reset())
 
+    @property
+    def episode_state(self) -> dict[str, npt.NDArray[Any]]:
+        """As of `DuffingVecEnv`."""
+        return self._duffing_envs.episode_state
+
     def restore_episode_state(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
-        """As `DuffingVecEnv.restore_episode_state`."""
-        return self._to_features(self.venv.restore_episode_state(memory))  # type: ignore[attr-defined]
+        """As of `DuffingVecEnv`."""
+        return self._to_features(self._duffing_envs.restore_episode_state(memory))
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Take what the network chose."""
+        """Take the actions of the network."""
         choices = actions[:, 0] if self._discrete_actions is None else self._discrete_actions[actions]
         self.venv.step_async(self._current_features.to_actions(choices))
 

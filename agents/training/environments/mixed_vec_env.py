@@ -1,10 +1,10 @@
-"""Environments of drawn options as Stable-Baselines3's `VecEnv`: groups of rows, each with options of its own."""
+"""A `VecEnv` whose environments have randomly drawn options: groups of rows, each group with its own options."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -21,31 +21,39 @@ from duffing_env.vector_env import DuffingVectorEnv
 from estimator.compilation.simd import LANES
 from estimator.support.argument_checks import short_repr
 
-#: Draws what a group plays next: the id of a track, and the options of its environments.
-DrawOptions = Callable[[np.random.Generator], tuple[str, dict[str, Any]]]
+
+class TrackOptions(NamedTuple):
+    """The id of a track, and the options of its environments."""
+
+    env_id: str
+    options: dict[str, Any]
+
+
+#: Draws the track and the options of a group of rows.
+DrawOptions = Callable[[np.random.Generator], TrackOptions]
 
 
 def draw_track_options(
     rng: np.random.Generator, env_id: str, options: dict[str, Any], ranges: Mapping[str, Sequence[float]]
-) -> tuple[str, dict[str, Any]]:
-    """A track with some of its options drawn, log-uniform: whole numbers between two of them, any between others.
+) -> TrackOptions:
+    """A track with log-uniformly drawn options; between two whole numbers, a whole number is drawn.
 
     Example:
         >>> import numpy as np
         >>> from agents.training.environments.mixed_vec_env import draw_track_options
         >>> drawn = draw_track_options(np.random.default_rng(1), "duffing_env/Power-v0", {}, {"horizon": (128, 1024)})
         >>> drawn
-        ('duffing_env/Power-v0', {'horizon': 371})
+        TrackOptions(env_id='duffing_env/Power-v0', options={'horizon': 371})
     """
     drawn = {}
     for name, (low, high) in ranges.items():
         value = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), high)
         drawn[name] = round(value) if isinstance(low, int) and isinstance(high, int) else value
-    return env_id, options | drawn
+    return TrackOptions(env_id, options | drawn)
 
 
 class _RowGroup:
-    """Rows with the same options, for as long as one of their episodes lasts."""
+    """Rows with the same options, for the length of an episode."""
 
     def __init__(
         self, rng: np.random.Generator, draw: DrawOptions, options: dict[str, Any], raw_observation: bool
@@ -59,28 +67,27 @@ class _RowGroup:
         self.weight = np.float32(has_shaping_potential(self.envs))
 
     def row_infos(self, **extra: Any) -> list[dict[str, Any]]:
-        """The infos of its rows at the last reset or step."""
+        """The infos of the rows at the last reset or step."""
         single = self.envs.single_env_class
         return infos_by_row(self.infos, (*single._info_gains, *single._info_flags), LANES, **extra)
 
 
 class MixedVecEnv(BatchVecEnv):
-    """Rows in groups of `estimator.compilation.simd.LANES`, each group with options of its own, seen as features.
+    """Environments in groups of `estimator.compilation.simd.LANES` rows, each group with its own options, as features.
 
-    A group draws anew when an episode has gone by; the rows that began another on the way, because a limit ended
-    theirs, are cut short. As in `agents.training.environments.feature_vec_env` the increase of what is still to come is added to the
-    reward.
+    A group draws new options after the length of an episode; an episode that began meanwhile, because a limit ended the
+    one before, is truncated. Rewards are shaped as in `FeatureVecEnv`.
 
     Args:
-        num_envs: rows, a multiple of `LANES`.
-        seed: of what is drawn, of oscillators and noise.
-        draw: what a group plays next.
-        reward: that counts information.
-        levels: an action is one of so many evenly spaced choices from -1 to 1, by its number; 0: any between.
-        raw_observation: whether the observation itself stands behind the features; then all that is drawn has one model.
+        num_envs: number of rows, a multiple of `LANES`.
+        seed: of options, oscillators and noise.
+        draw: draws the track and the options of a group.
+        reward: name of a reward that is information.
+        levels: number of evenly spaced actions from -1 to 1, chosen by their index; 0: all actions between.
+        raw_observation: whether the observation follows the features; all tracks then must have one model.
 
     Raises:
-        ValueError: for another number of rows.
+        ValueError: for a number of rows that is no multiple of `LANES`.
     """
 
     def __init__(
@@ -115,10 +122,10 @@ class MixedVecEnv(BatchVecEnv):
         return _RowGroup(rng, self._draw, self._fixed_options, self._raw_observation)
 
     def reset(self) -> VecEnvObs:
-        """Show what every row sees; the episodes have begun.
+        """The first observations of the episodes, which have begun.
 
         Raises:
-            ValueError: for options of `set_options`: they are drawn here.
+            ValueError: for options of `set_options`, because options are drawn here.
         """
         if any(self._options):
             raise ValueError(
@@ -129,11 +136,11 @@ class MixedVecEnv(BatchVecEnv):
 
     @property
     def tensors(self) -> dict[str, npt.NDArray[Any]]:
-        """The normaliser, as a policy's file holds it; the setting is that of the environment that is played."""
+        """The normaliser, by its names in a policy's file, which takes the setting from the environment it plays in."""
         return self.normalizer.to_tensors()
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Take what the network chose."""
+        """Take the actions of the network."""
         self._choices = actions[:, 0] if self._discrete_actions is None else self._discrete_actions[actions]
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -174,7 +181,7 @@ class MixedVecEnv(BatchVecEnv):
         return self.normalizer(values), rewards, dones, rows
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """As of `BatchVecEnv`; options of the environments are refused."""
+        """As of `BatchVecEnv`."""
         if hasattr(self._groups[0].envs, attr_name):
             setattr(self._groups[0].envs, attr_name, value)
         super().set_attr(attr_name, value, indices)
@@ -185,5 +192,5 @@ class MixedVecEnv(BatchVecEnv):
             group.envs.close()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Nothing: the seed is that of the constructor."""
+        """Do nothing: the constructor's seed holds."""
         return [None] * self.num_envs

@@ -1,7 +1,7 @@
-"""A family of oscillators without units: what a policy for all of them is trained on, and judged by.
+"""A random family of dimensionless oscillators, on which one policy for all of them is trained and evaluated.
 
-Time is counted in samples, the input in parts of its limit, and the displacement in parts of its limit X. A draw is a
-rig with the options of ``Rig-v0``: the environment then draws oscillators from the rig's guess.
+Time is in samples, the input in units of its limit, and the displacement in units of its limit X. A draw is a rig with
+the options of ``Rig-v0``: the environment then draws oscillators from the rig's guess.
 """
 
 from __future__ import annotations
@@ -10,52 +10,71 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.track_ids import RIG_TRACK
-
-#: What is trained on it, in the place of a track.
+#: Name of the family, in place of a track.
 FAMILY = "family"
 
-#: Samples that show how features vary: about the middle of `EPISODE_SAMPLES_RANGE`, on a logarithmic scale.
+#: Samples from which the normaliser of the features is fitted: about the geometric mean of `EPISODE_SAMPLES_RANGE`.
 TYPICAL_SAMPLES = 256
 
-#: Kinds of stiffness, and how often each is drawn.
+#: Kind of stiffness to its probability.
 STIFFNESS_PROBABILITIES = {"hardening": 0.5, "softening": 0.25, "double-well": 0.25}
 
-#: Ranges, log-uniform: samples per period of small motions, damping ratio, b X²/a of a hardening spring, -b X²/a of a
-#: softening one (whose force must not fall within X), the wells' place in parts of X, the input limit in parts of the
-#: static force that holds the oscillator at X, σ_v in parts of X, σ_w in parts of σ_v, half width of the guess, samples
-#: of an episode, and the input's root mean square in parts of its limit where the energy is limited.
-PERIOD_RANGE, DAMPING_RANGE, HARDENING_RANGE, SOFTENING_RANGE, WELL_RANGE = (
-    (6.0, 60.0),
-    (0.002, 0.3),
-    (0.1, 5.0),
-    (0.05, 0.3),
-    (0.3, 0.7),
-)
-DRIVE_RANGE, SENSOR_NOISE_RANGE, NOISE_RATIO_RANGE, GUESS_HALF_WIDTH_RANGE = (
-    (0.02, 1.0),
-    (1e-4, 1e-2),
-    (0.1, 10.0),
-    (0.1, 0.6),
-)
-EPISODE_SAMPLES_RANGE, RMS_RANGE = (64, 1024), (0.1, 0.5)
+# The following ranges are log-uniform.
 
-#: What the sensor shows, and how often.
+#: Period of small motions [samples].
+PERIOD_RANGE = (6.0, 60.0)
+
+#: Damping ratio.
+DAMPING_RANGE = (0.002, 0.3)
+
+#: b X²/a of a hardening spring.
+HARDENING_RANGE = (0.1, 5.0)
+
+#: -b X²/a of a softening spring, whose force must not fall within X.
+SOFTENING_RANGE = (0.05, 0.3)
+
+#: Position of the wells of a double-well oscillator [X].
+WELL_RANGE = (0.3, 0.7)
+
+#: Limit of the input, divided by the static force that holds the oscillator at X.
+DRIVE_RANGE = (0.02, 1.0)
+
+#: Standard deviation σ_v of the sensor's noise [range of the output].
+SENSOR_NOISE_RANGE = (1e-4, 1e-2)
+
+#: Process noise σ_w divided by σ_v.
+NOISE_RATIO_RANGE = (0.1, 10.0)
+
+#: Half width of the guess, relative.
+GUESS_HALF_WIDTH_RANGE = (0.1, 0.6)
+
+#: Length of an episode [samples].
+EPISODE_SAMPLES_RANGE = (64, 1024)
+
+#: Largest RMS of the input, where its energy is limited [limit of the input].
+RMS_RANGE = (0.1, 0.5)
+
+#: Kind of sensor to its probability.
 SENSOR_PROBABILITIES = {"displacement": 0.7, "velocity": 0.3}
 
-#: How often the energy is limited, and how often the noises are known; where process noise alone may move the
-#: oscillator to, in parts of X.
-LIMITED_ENERGY_PROBABILITY, KNOWN_NOISES_PROBABILITY, MAX_NOISE_DISPLACEMENT = 0.25, 0.25, 0.15
+#: Probability that the energy of the input is limited.
+LIMITED_ENERGY_PROBABILITY = 0.25
+
+#: Probability that the noises are known.
+KNOWN_NOISES_PROBABILITY = 0.25
+
+#: Largest RMS displacement by process noise alone [X].
+MAX_NOISE_DISPLACEMENT = 0.15
 
 
 class FamilyMember(NamedTuple):
-    """A draw.
+    """An oscillator of the family.
 
     Attributes:
-        stiffness: of `STIFFNESS_PROBABILITIES`.
-        period: samples in a period of small motions.
-        damping: ratio.
-        drive: the input's limit in parts of the static force at X.
+        stiffness: a key of `STIFFNESS_PROBABILITIES`.
+        period: of small motions [samples].
+        damping: damping ratio.
+        drive: the input's limit divided by the static force at X.
         options: of ``Rig-v0``.
     """
 
@@ -67,7 +86,7 @@ class FamilyMember(NamedTuple):
 
 
 def draw_oscillator(rng: np.random.Generator) -> FamilyMember:
-    """A rig of the family.
+    """Draw an oscillator of the family.
 
     Example:
         >>> import numpy as np
@@ -82,7 +101,7 @@ def draw_oscillator(rng: np.random.Generator) -> FamilyMember:
 
     stiffness = str(rng.choice(list(STIFFNESS_PROBABILITIES), p=list(STIFFNESS_PROBABILITIES.values())))
     period, damping, drive = log_uniform(*PERIOD_RANGE), log_uniform(*DAMPING_RANGE), log_uniform(*DRIVE_RANGE)
-    # Linear and cubic stiffness up to a factor, and the stiffness of small motions.
+    # Linear and cubic stiffness, and the stiffness of small motions, up to a common factor.
     if stiffness == "double-well":
         well = log_uniform(*WELL_RANGE)
         a, b, linearised_stiffness = -1.0, 1.0 / well**2, 2.0
@@ -104,7 +123,7 @@ def draw_oscillator(rng: np.random.Generator) -> FamilyMember:
     output_range = 1.0 if sensor_kind == "displacement" else omega
     sensor_noise = log_uniform(*SENSOR_NOISE_RANGE)
     samples = int(log_uniform(*EPISODE_SAMPLES_RANGE))
-    # What white noise alone shakes the oscillator to, by the end or in balance with damping.
+    # RMS displacement by white noise alone, at the end of the episode or in equilibrium with damping.
     noise_displacement = np.sqrt(1.5 * min(samples, 0.5 / (damping * omega))) / omega
     process_noise = min(sensor_noise * log_uniform(*NOISE_RATIO_RANGE), MAX_NOISE_DISPLACEMENT / noise_displacement)
     rig = {
@@ -124,8 +143,3 @@ def draw_oscillator(rng: np.random.Generator) -> FamilyMember:
     if rng.uniform() < KNOWN_NOISES_PROBABILITY:
         options |= {"noise_range": 1.0, "noise_hypotheses": 1}
     return FamilyMember(stiffness, period, damping, drive, options)
-
-
-def draw_rig_track(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
-    """A rig of the family, as `agents.training.environments.mixed_vec_env.DrawOptions`."""
-    return RIG_TRACK, draw_oscillator(rng).options
