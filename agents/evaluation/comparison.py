@@ -1,4 +1,4 @@
-"""Policies compared: evaluated on the same systems, in a table, a file, and figures or a report."""
+"""Comparison of policies on the same systems: tables, evaluation.json, and figures or an HTML report."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 
 from agents.console_output import print_wrapped
 from agents.evaluation.comparison_tables import (
+    ComparisonSettings,
     print_comparison_table,
     print_estimator_table,
     print_headline_table,
     write_evaluations,
 )
-from agents.evaluation.policy_evaluation import Evaluation, evaluate_policies
+from agents.evaluation.policy_evaluation import evaluate_policies
+from agents.evaluation.policy_rollout import Evaluation
 from agents.output_paths import check_output_file, check_output_folder
 from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import load_policy
@@ -24,16 +26,14 @@ from duffing_env.plants.silverbox_record import record_available
 from estimator.support.optional_dependencies import install_hint, is_not_installed, require_packages
 from estimator.support.progress import show_progress
 
-#: What every input has to beat.
+#: Signals in every default comparison.
 BASELINE_SIGNALS = ("prbs", "uniform")
 
 
 def default_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
-    """What is compared on a track where nothing else is asked for.
+    """The policies that are compared on a track by default: trained ones that ship, shield, planner and two signals.
 
-    That is what ships for it, the shield alone, the planner, and two signals.
-
-    A record can be asked for its own input only; and all but the signals look at the posterior.
+    On a record, its own input is the only policy; without the posterior in the observation, only the signals play.
     """
     track_options = env_spec_of(env_id).kwargs
     if track_options.get("regime") is not None:
@@ -41,7 +41,7 @@ def default_policies(env_id: str, options: dict[str, Any]) -> tuple[str, ...]:
     if {**track_options, **options}.get("observation", "posterior") != "posterior":
         return BASELINE_SIGNALS
     shipped = [name for name in trained_policies() if load_policy(TRAINED / name).card["track"] == env_id]
-    # These decide sample by sample.
+    # These choose an input for every sample.
     per_sample_policies = ["shield", "efe"] if options.get("hold", 1) == 1 else []
     return (*shipped, *per_sample_policies, *BASELINE_SIGNALS)
 
@@ -62,16 +62,16 @@ def compare_policies(
     Args:
         policies: as of `agents.evaluation.policy_evaluation.evaluate_policies`.
         env_id: the track.
-        n_systems: that every policy is evaluated on.
+        n_systems: number of systems.
         options: of the environment.
-        folder: to write to.
+        folder: for the files.
         seed: of systems and noise.
         as_report: whether to write a report in place of the figures.
-        headline_only: whether to print the chief figures alone, a line for each policy.
+        headline_only: whether to print the headline table alone.
 
     Raises:
-        ModuleNotFoundError: for a report without matplotlib. Figures are left out without it.
-        OSError: where the folder is a file, or nothing can be written there, before a policy plays.
+        ModuleNotFoundError: for a report without matplotlib; without it figures are left out.
+        OSError: for a folder that is a file or cannot be written to, before a policy plays.
     """
     if as_report:
         require_packages("matplotlib")
@@ -80,31 +80,37 @@ def compare_policies(
     with show_progress("Evaluating") as on_progress:
         evaluations = evaluate_policies(policies, env_id, n_systems, seed, options, on_progress=on_progress)
     title = f"{env_id}, {n_systems} systems"
-    settings = {"env": env_id, "systems": n_systems, "seed": seed, "options": options}
+    settings = ComparisonSettings(env_id, n_systems, seed, options)
     write_evaluations(folder / "evaluation.json", evaluations, settings)
-    written = ["evaluation.json"]
-    if as_report:
-        from agents.evaluation.html_report import write_html_report
-
-        write_html_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
-        written += ["report.html"]
-    elif not is_not_installed("matplotlib"):
-        from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
-
-        save_png(plot_posterior_contraction(evaluations, title), folder / "contraction.png")
-        save_png(plot_inputs_and_outputs(evaluations), folder / "excitations.png")
-        written += ["contraction.png", "excitations.png"]
+    figures = _write_report(folder, evaluations, settings) if as_report else _write_figures(folder, evaluations, title)
     if headline_only:
         print_headline_table(evaluations, title)
     else:
         print_comparison_table(evaluations, title)
         print_estimator_table(evaluations)
     if not headline_only and not record_available() and env_id != RIG_TRACK and "error_m" in evaluations[0].metrics:
-        print_wrapped(
-            "What is measured by the Silverbox record is left out: the Silverbox record is not on this machine."
-        )
-    if len(written) == 1:
+        print_wrapped("Metrics by the Silverbox record are left out: the Silverbox record is not on this machine.")
+    if not figures:
         print_wrapped(f"Figures are left out: {install_hint('matplotlib')}")
-    for name in written:
+    for name in ("evaluation.json", *figures):
         print_wrapped(str(folder / name))
     return evaluations
+
+
+def _write_report(folder: Path, evaluations: list[Evaluation], settings: ComparisonSettings) -> tuple[str, ...]:
+    """Write the report; returns the names of its files."""
+    from agents.evaluation.html_report import write_html_report
+
+    write_html_report(folder / "report.html", evaluations, settings, [Path(sys.argv[0]).name, *sys.argv[1:]])
+    return ("report.html",)
+
+
+def _write_figures(folder: Path, evaluations: list[Evaluation], title: str) -> tuple[str, ...]:
+    """Write the figures, where matplotlib is installed; returns the names of their files."""
+    if is_not_installed("matplotlib"):
+        return ()
+    from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
+
+    save_png(plot_posterior_contraction(evaluations, title), folder / "contraction.png")
+    save_png(plot_inputs_and_outputs(evaluations), folder / "excitations.png")
+    return "contraction.png", "excitations.png"

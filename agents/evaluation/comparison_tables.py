@@ -1,9 +1,9 @@
-"""The leaderboard: policies side by side, every figure with its interval; as a table, JSON and figures."""
+"""Tables of a comparison of policies, printed or for a page, and evaluation.json."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,21 @@ from agents.evaluation.metric_summary import (
     metric_columns,
     summarise_metrics,
 )
-from agents.evaluation.policy_evaluation import Evaluation
+from agents.evaluation.policy_rollout import Evaluation
 from agents.result_files import write_json
 
-#: The chief ones, with titles for a table of 80 characters; and those whose spread it has.
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """Settings of a comparison: the track, its number of systems, their seed, and the options of the environment."""
+
+    env: str
+    systems: int
+    seed: int
+    options: dict[str, Any]
+
+
+#: Metrics of the headline table, with titles for a width of 80 characters.
 HEADLINE_TITLES = {
     "information_gain": "information / nat",
     "efficiency": "D-efficiency / %",
@@ -28,15 +39,17 @@ HEADLINE_TITLES = {
     "ended_early": "early / %",
     "decision_time": "µs",
 }
+
+#: Metrics of this table with half of their interval.
 _HEADLINE_WITH_INTERVAL = ("information_gain", "efficiency")
 
 
-#: What the auditor of the second table is.
+#: Explanation of the auditor, below the table of estimators.
 AUDITOR_EXPLANATION = "the auditor: an offline maximum a posteriori fit that knows the noises"
 
 
-def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[str, Any]) -> None:
-    """Write summaries and the settings that they were made with."""
+def write_evaluations(path: Path, evaluations: list[Evaluation], settings: ComparisonSettings) -> None:
+    """Write evaluation.json: the settings of a comparison, and the summaries of all metrics."""
     results = {
         evaluation.policy: {
             **summarise_metrics(evaluation),
@@ -47,17 +60,18 @@ def write_evaluations(path: Path, evaluations: list[Evaluation], settings: dict[
         }
         for evaluation in evaluations
     }
-    write_json(path, {"settings": settings, "policies": results})
+    write_json(path, {"settings": asdict(settings), "policies": results})
 
 
+#: Headings and rows of a table.
 HeadingsAndRows = tuple[list[str], list[list[str]]]
 
-#: Of a column [characters].
+#: Largest width of a column [characters].
 _MAX_COLUMN_WIDTH = 36
 
 
 def comparison_table(evaluations: list[Evaluation]) -> HeadingsAndRows:
-    """Heads and rows: a column for each policy, the best log posterior gain first; `metric_cell` each metric."""
+    """A row for each metric, and a column for each policy, the best log posterior gain first."""
     ordered = sort_by_log_posterior_gain(evaluations)
     summaries = [summarise_metrics(evaluation) for evaluation in ordered]
     rows = [
@@ -70,20 +84,20 @@ def comparison_table(evaluations: list[Evaluation]) -> HeadingsAndRows:
 
 
 def policy_by_estimator_table(evaluations: list[Evaluation]) -> HeadingsAndRows:
-    """Heads and rows, policies by estimators: who identified what from the same inputs and outputs."""
+    """A row for each policy and estimator: metrics of the estimator on the policy's inputs and outputs."""
     found = [name for e in evaluations for values in e.estimator_metrics.values() for name in values]
     columns = {name: m for name, m in metric_columns(found).items() if name not in ("coverage_50", "coverage_95")}
     rows = []
     for evaluation in sort_by_log_posterior_gain(evaluations):
         for estimator, values in evaluation.estimator_metrics.items():
-            centers = {name: float(metric.center[1](values[name])) for name, metric in columns.items()}
+            centers = {name: float(metric.center.function(values[name])) for name, metric in columns.items()}
             cells = [metric.format_value(centers[name]) for name, metric in columns.items()]
             rows.append([evaluation.title, estimator.replace("_", " "), *cells])
     return ["policy", "estimator", *(metric.title for metric in columns.values())], rows
 
 
 def print_comparison_table(evaluations: list[Evaluation], title: str) -> None:
-    """Print the leaderboard, with the intervals below."""
+    """Print the table of all metrics, with their intervals."""
     from rich.table import Table as RichTable
 
     headings, rows = comparison_table(evaluations)
@@ -102,7 +116,7 @@ def print_comparison_table(evaluations: list[Evaluation], title: str) -> None:
 
 
 def headline_table(evaluations: list[Evaluation]) -> HeadingsAndRows:
-    """Heads and rows: a line for each policy, with the chief figures, which are in ``HEADLINE_TITLES``."""
+    """A row for each policy, with the metrics of `HEADLINE_TITLES`."""
     titles = {name: title for name, title in HEADLINE_TITLES.items() if name in evaluations[0].metrics}
     rows = []
     for evaluation in evaluations:
@@ -121,7 +135,7 @@ def headline_table(evaluations: list[Evaluation]) -> HeadingsAndRows:
 
 
 def print_headline_table(evaluations: list[Evaluation], title: str) -> None:
-    """Print the chief figures, in 80 columns."""
+    """Print the headline table, in 80 columns."""
     headings, rows = headline_table(evaluations)
     caption = "means over systems ± half of the 95 % bootstrap interval; 90 % intervals that cover; "
     caption += "episodes that a limit ended early; time of a decision"
@@ -131,20 +145,20 @@ def print_headline_table(evaluations: list[Evaluation], title: str) -> None:
 
 
 def print_estimator_table(evaluations: list[Evaluation]) -> None:
-    """Print the two-way table, where there is something in it."""
+    """Print the table of policies by estimators, unless it is empty."""
     headings, rows = policy_by_estimator_table(evaluations)
     if rows:
-        title = "what other estimators make of the same inputs and outputs"
+        title = "other estimators on the same inputs and outputs"
         print_texts_and_tables(format_table(headings, rows, title=title, n_labels=2), AUDITOR_EXPLANATION)
 
 
 def sort_by_log_posterior_gain(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """The best log posterior gain first."""
+    """The evaluations, the best log posterior gain first."""
     return sorted(evaluations, key=lambda evaluation: -float(evaluation.metrics["log_posterior_gain"].mean()))
 
 
 def table_caption(evaluations: list[Evaluation]) -> str:
-    """What the figures of a table are, and what its less known metrics mean, a line each."""
+    """The statistics in a table, and explanations of its less known metrics, a line each."""
     several = any(evaluation.seeds > 1 for evaluation in evaluations)
     seed_note = "of several seeds interquartile means, shares as means, and the median seed; " if several else ""
     found = {name for evaluation in evaluations for name in evaluation.metrics}

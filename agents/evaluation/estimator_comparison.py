@@ -1,8 +1,6 @@
-"""Other estimators on the inputs and outputs of a policy: their errors and calibration, and those of an offline fit."""
+"""Other estimators on the inputs and outputs of a policy: errors and calibration, also of an offline fit."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -15,23 +13,32 @@ from estimator.inference.batch_posteriors import posteriors
 from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
 from estimator.rigs.rig import Rig
-from estimator.support.array_types import FloatArray
+from estimator.support.array_types import FloatArray, Parameters
 
-#: Who else identifies the systems from what a policy left behind, beside the environment's own estimator.
+#: Name of the offline maximum a posteriori fit.
 AUDITOR = "auditor"
 
-
+#: Factorisations of the posterior of the difference equation, each an estimator.
 FACTORISATIONS = ("structured", "mean_field")
 
 
 def estimate_with_other_estimators(
-    inputs: FloatArray, outputs: FloatArray, truth: Any, experiment: SimulatedExperiment
+    inputs: FloatArray, outputs: FloatArray, truth: Parameters, experiment: SimulatedExperiment
 ) -> dict[str, dict[str, FloatArray]]:
-    """What every estimator of the plant, and the auditor, make of the inputs and outputs of a policy.
+    """Metrics of every estimator of the plant, and of the auditor, on the inputs and outputs of a policy.
 
-    The auditor fits the plant's own equation, from the prior's mean and from where estimators of it ended: of a wide
-    guess, the prior's mean alone may lead to a minimum far off. The equation of the paper, on a plant whose
-    input goes linearly from one action to the next, takes as an environment does the input at the sample before.
+    The auditor fits the plant's own equation, starting from the prior's mean and from the results of the estimators of
+    this equation: with a wide guess, the prior's mean alone may lead to a distant local minimum. On a plant whose input
+    is linear between samples, the paper's equation takes the input at the sample before, as an environment does.
+
+    Args:
+        inputs: (T, n).
+        outputs: (T, n) or (T, n, sensors).
+        truth: true parameters (n,).
+        experiment: of the environments.
+
+    Returns:
+        Name of the estimator to `agents.evaluation.metrics.posterior_metrics`.
     """
     u, y = inputs.T, np.swapaxes(outputs, 0, 1)
     plant, interpolation, own_prior, process_noise, sensor_noises = plant_model_of(experiment, truth)
@@ -41,7 +48,7 @@ def estimate_with_other_estimators(
         estimators = {name: (experiment.prior_for_model(plant, name), u) for name in FACTORISATIONS}
     else:
         name = "ode" if plant.is_continuous else "structured"
-        # The environment's own estimator, without the hypotheses that it may weigh.
+        # The environment's own estimator, without its noise hypotheses.
         estimators[f"{name}_alone" if experiment.noise_hypotheses != 1 else name] = own_prior, u
         if set(parameter_names(plant)) == set(parameter_names(difference())):
             previous_inputs = (

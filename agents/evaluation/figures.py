@@ -1,4 +1,4 @@
-"""Figures of trainings, evaluations and experiments to come. No display is needed."""
+"""Figures of trainings, evaluations and designed experiments, with matplotlib and without a display."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from estimator.support.optional_dependencies import require_packages
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from agents.evaluation.policy_evaluation import Evaluation
+    from agents.evaluation.policy_rollout import Evaluation
     from agents.hardware.next_experiment import ExperimentDesign
     from agents.training.checkpoints import LearningPoint
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
 _LINE_STYLES = ("-", "--", ":")
 
-#: A limit is drawn where a signal comes as near as this part of it: one that is far away would hide the signal.
+#: A limit is drawn if a signal reaches this fraction of it; a more distant one would shrink the signal.
 _SHOW_LIMIT_FROM = 0.5
 
-#: Of fewer points each is marked.
+#: Points are marked where there are fewer of them than this.
 _MARK_POINTS_BELOW = 20
 
 
@@ -51,13 +51,13 @@ def new_figure(width: float, height: float) -> Figure:
 def plot_learning_curve(
     curve: Sequence[LearningPoint], reward: str, held_out: Sequence[tuple[int, float]] = ()
 ) -> Figure:
-    """Mean return of the last episodes over the samples that were trained on, with wall time above.
+    """Mean return of the last episodes over the training samples, with the wall time above.
 
     Args:
-        curve: samples, seconds, mean return.
+        curve: points of the learning curve.
         reward: its name.
-        held_out: samples, and the information [nats] that the policy of then gains on systems held out, in a panel
-            below; the first is of the untrained network.
+        held_out: samples, and the information gain [nats] of the policy on held-out systems, drawn in a panel below;
+            the first point is the untrained network.
     """
     figure = new_figure(7, 6.5 if held_out else 4)
     axes, *below = figure.subplots(2 if held_out else 1, squeeze=False)[:, 0]
@@ -86,10 +86,10 @@ def plot_learning_curve(
 
 
 def plot_posterior_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
-    """Gain of log posterior of the truth over the samples: median over systems, band from 25 to 75 %."""
+    """Gain of the log posterior at the truth over the samples: median over systems, band from 25 to 75 %."""
     figure = new_figure(7.5, 4.5 + 0.22 * math.ceil(len(evaluations) / 3))
     axes = figure.add_subplot()
-    lowest = 0.0  # an over-confident posterior may lose
+    lowest = 0.0  # the gain of an over-confident posterior may be negative
     line_looks = product(_LINE_STYLES, _COLOURS)
     for evaluation, (line_style, colour) in zip(evaluations, cycle(line_looks), strict=False):
         low, median, high = np.percentile(evaluation.gain_curve, [25, 50, 75], axis=1)
@@ -100,16 +100,16 @@ def plot_posterior_contraction(evaluations: list[Evaluation], title: str = "") -
     axes.set(xlabel="samples", ylabel="log posterior gain of the truth / nat", title=title)
     axes.set(xlim=(0, None), ylim=(lowest, None))
     axes.grid(alpha=0.3)
-    # Within the axes it would cover curves.
+    # Within the axes the legend would cover curves.
     legend_title = "medians, and bands from 25 to 75 % of the systems"
     figure.legend(loc="outside lower center", ncols=min(3, len(evaluations)), title=legend_title, title_fontsize=9)
     return figure
 
 
 def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
-    """Input and output of the first system in time; of the inputs' spectrum the root of the mean power over systems.
+    """Input and output of the first system in time, and the inputs' RMS spectrum over systems.
 
-    Of several sensors the first is shown. Dashed lines are limits that are come near to.
+    Of several sensors the first is drawn. Dashed lines are limits, where a signal comes near to them.
     """
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
@@ -119,7 +119,7 @@ def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
         spectrum_unit, factor = "mV", 1e3 * factor
     for row, evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
         time = 1e3 * scales.step * np.arange(len(evaluation.inputs))
-        inputs = np.nan_to_num(evaluation.inputs)  # an episode that ended is silent
+        inputs = np.nan_to_num(evaluation.inputs)  # zero after the end of an episode
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         first_sensor = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
@@ -166,7 +166,7 @@ def plot_error_against_information(evaluations: list[Evaluation]) -> Figure | No
 
 
 def plot_calibration(evaluations: list[Evaluation]) -> Figure:
-    """Share of intervals that hold the truth against their nominal level: a panel for each estimator."""
+    """Proportion of intervals that hold the truth against their nominal level: a panel for each estimator."""
     from agents.evaluation.metrics import CREDIBLE_LEVELS
 
     metrics_by_estimator = [evaluation.estimator_metrics or {"": evaluation.metrics} for evaluation in evaluations]
@@ -189,7 +189,7 @@ def plot_calibration(evaluations: list[Evaluation]) -> Figure:
 
 
 def plot_experiment_design(experiment_design: ExperimentDesign) -> Figure:
-    """The signal of an experiment to come, and what the sensor is expected to show, both with their limits."""
+    """The signal of a designed experiment and the predicted output, both with their limits."""
     figure, rig = new_figure(9, 5), experiment_design.rig
     above, below = figure.subplots(2, 1, sharex=True)
     time = rig.step * np.arange(len(experiment_design.u))

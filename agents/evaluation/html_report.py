@@ -1,4 +1,4 @@
-"""One page that shows a comparison: a single HTML file, which opens without a network, on a phone and in print."""
+"""HTML report of a comparison of policies: a single file, which opens without a network, on a phone and in print."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import html
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from agents.evaluation.comparison_tables import (
     AUDITOR_EXPLANATION,
+    ComparisonSettings,
     comparison_table,
     policy_by_estimator_table,
     table_caption,
@@ -20,24 +20,24 @@ from agents.evaluation.figures import (
     plot_inputs_and_outputs,
     plot_posterior_contraction,
 )
-from agents.evaluation.policy_evaluation import Evaluation
+from agents.evaluation.policy_rollout import Evaluation
 from agents.result_files import package_versions
 from estimator.support.file_io import write_atomically
 from estimator.support.html_page import figure_to_svg, html_document, html_table
 
 
 def write_html_report(
-    path: Path, evaluations: list[Evaluation], settings: dict[str, Any], command: Sequence[str]
+    path: Path, evaluations: list[Evaluation], settings: ComparisonSettings, command: Sequence[str]
 ) -> None:
-    """Write the page, in one piece.
+    """Write the report, in one piece.
 
     Args:
         path: of the HTML file.
         evaluations: at least one.
-        settings: of the comparison: ``env``, ``systems``, ``seed``, ``options``.
-        command: the words of the command line that made it.
+        settings: of the comparison.
+        command: words of the command line.
     """
-    title = f"{settings['env']}: {', '.join(evaluation.title for evaluation in evaluations)}"
+    title = f"{settings.env}: {', '.join(evaluation.title for evaluation in evaluations)}"
     figures = [
         (
             "Posterior contraction",
@@ -52,25 +52,25 @@ def write_html_report(
         (
             "Error against information",
             plot_error_against_information(evaluations),
-            "Each point is a system. What an input tells (Fisher information at the truth) bounds what can be known; "
-            "an estimator that lies far above the others wastes it.",
+            "Each point is a system. The Fisher information of an input at the truth bounds the error from below; "
+            "an estimator far above the others loses information.",
         ),
         (
             "Calibration",
             plot_calibration(evaluations),
-            "Share of intervals that hold the truth, against their nominal level; a calibrated posterior lies on the "
-            "line, an over-confident one below it.",
+            "Proportion of intervals that hold the truth, against their nominal level; a calibrated posterior lies on "
+            "the line, an over-confident one below it.",
         ),
     ]
     headings, rows = comparison_table(evaluations)
     parts = [
-        f"<h1>{html.escape(settings['env'])}</h1>",
-        f"<p>{settings['systems']} systems, seed {settings['seed']}, the same for every policy; "
-        f"options <code>{html.escape(json.dumps(settings['options']))}</code>.</p>",
+        f"<h1>{html.escape(settings.env)}</h1>",
+        f"<p>{settings.systems} systems, seed {settings.seed}, the same for every policy; "
+        f"options <code>{html.escape(json.dumps(settings.options))}</code>.</p>",
         "<h2>Leaderboard</h2>",
         html_table(headings, [[title, *map(_html_metric_cell, cells)] for title, *cells in rows]),
-        f"<p><small>{_lines_to_sentences(table_caption(evaluations))} An episode that a limit ends counts with what was known by "
-        "then.</small></p>",
+        f"<p><small>{_lines_to_sentences(table_caption(evaluations))} An episode that a limit ends counts with its "
+        "last belief.</small></p>",
         _estimator_section(evaluations),
     ]
     for heading, figure, caption in figures:
@@ -94,18 +94,18 @@ def _lines_to_sentences(lines: str) -> str:
 
 
 def _html_metric_cell(cell: str) -> str:
-    """A cell of the leaderboard, whose interval stands smaller below the centre."""
+    """A cell of the table as HTML, with the interval in small letters below the centre."""
     center, _, below = cell.partition("\n")
     return f"{center}<br><small>{below.replace(chr(10), '<br>')}</small>"
 
 
 def _estimator_section(evaluations: list[Evaluation]) -> str:
-    """The two-way table, policies by estimators; nothing where there is one estimator only."""
+    """The table of policies by estimators; empty where there are no other estimators."""
     headings, rows = policy_by_estimator_table(evaluations)
     if not rows:
         return ""
     return (
-        "<h2>What other estimators make of the same inputs and outputs</h2>"
-        f"<p>{_lines_to_sentences(AUDITOR_EXPLANATION)} It ranks the inputs; the rows of one policy rank the estimators.</p>"
-        + html_table(headings, [[html.escape(cell) for cell in row] for row in rows])
+        "<h2>Other estimators on the same inputs and outputs</h2>"
+        f"<p>{_lines_to_sentences(AUDITOR_EXPLANATION)} It ranks the inputs; the rows of one policy rank the "
+        "estimators.</p>" + html_table(headings, [[html.escape(cell) for cell in row] for row in rows])
     )

@@ -5,41 +5,62 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, Required, TypedDict, cast
 
 import numpy as np
 from scipy import stats
 
-from agents.evaluation.policy_evaluation import Evaluation
+from agents.evaluation.policy_rollout import Evaluation
 from estimator.rigs.units import axis_label
 from estimator.support.array_types import FloatArray
 
+#: Bootstrap resamples of an interval.
 _N_RESAMPLES = 2000
 
 
-NamedStatistic = tuple[str, Callable[..., Any]]
+class NamedStatistic(NamedTuple):
+    """A statistic over systems, and its name in files."""
+
+    name: str
+    function: Callable[..., Any]
 
 
-MEAN: NamedStatistic = ("mean", np.mean)
+class MetricSummary(TypedDict, total=False):
+    """A metric over systems, as files hold it: its centre under the name of the statistic, and a 95 % interval.
+
+    ``seeds``, the centre of each training seed, and ``median_of_seeds`` are there for several seeds only.
+    """
+
+    mean: float
+    median: float
+    iqm: float
+    low: Required[float]
+    high: Required[float]
+    median_of_seeds: float
+    seeds: list[float]
 
 
-MEDIAN: NamedStatistic = ("median", np.median)
+MEAN = NamedStatistic("mean", np.mean)
 
 
-IQM: NamedStatistic = ("iqm", partial(stats.trim_mean, proportiontocut=0.25))
+MEDIAN = NamedStatistic("median", np.median)
+
+
+#: Interquartile mean.
+IQM = NamedStatistic("iqm", partial(stats.trim_mean, proportiontocut=0.25))
 
 
 @dataclass(frozen=True)
 class MetricColumn:
-    """A column of the table.
+    """A metric as a column of tables.
 
     Attributes:
-        title: with its unit.
-        decimals: decimals that are printed; of what may have any size, less than 0 the significant ones.
-        scale: from the stored to the printed unit.
-        center: the statistic over systems, and its name.
-        center_of_seeds: the same over systems and training seeds, by default the interquartile mean. Of shares it is
-            the mean: the middle half of an event that is rare never sees it.
+        title: with the unit.
+        decimals: number of decimals; if negative, number of significant digits.
+        scale: factor from the stored to the printed unit.
+        center: statistic over systems.
+        center_of_seeds: statistic over systems and training seeds: the interquartile mean, but the mean of proportions,
+            because the middle half of the values contains no rare event.
     """
 
     title: str
@@ -49,7 +70,7 @@ class MetricColumn:
     center_of_seeds: NamedStatistic = IQM
 
     def format_value(self, value: float) -> str:
-        """A value as it is printed."""
+        """A value as a text, in the printed unit."""
         form = f".{self.decimals}f" if self.decimals >= 0 else f".{-self.decimals}g"
         return format(self.scale * value, form)
 
@@ -76,7 +97,7 @@ METRIC_COLUMNS = {
     "fisher_gain": MetricColumn("Fisher information / nat", 2),
     "efficiency": MetricColumn("D-efficiency, of the best known / %", 1, 100),
     "certified": MetricColumn("at least, of what is possible / %", 1, 100),
-    # Infinite where the whole regime tells less, so only a median says something of many.
+    # Infinite where the whole regime has less information, so that only a median is finite.
     "silverbox_equivalent": MetricColumn("Silverbox equivalent / samples", 0, 1.0, MEDIAN, MEDIAN),
     "full_peak_equivalent": MetricColumn("the same at full peak / samples", 0, 1.0, MEDIAN, MEDIAN),
     "simulation_rmse": MetricColumn("RMSE on the twin's arrow / mV", 3, 1e3, MEDIAN),
@@ -84,22 +105,21 @@ METRIC_COLUMNS = {
 }
 
 
-#: What the less known of them are, where they are in a table.
+#: Explanations of less known metrics, below a table.
 METRIC_EXPLANATIONS = {
     "nees": "NEES: squared error in units of the believed covariance; 1 where beliefs are right",
-    "efficiency": "D-efficiency: information per coefficient, in parts of the best input that a search found which "
-    "knows the system",
-    "certified": "at least: the same, in parts of an upper bound of what any input tells",
-    "silverbox_equivalent": "Silverbox equivalent: samples of the benchmark's multisine that tell as much",
+    "efficiency": "D-efficiency: information per coefficient, relative to the best known input for the true system",
+    "certified": "at least: the same, relative to an upper bound over all inputs",
+    "silverbox_equivalent": "Silverbox equivalent: samples of the benchmark's multisine with as much information",
 }
 
 
 def metric_columns(names: Iterable[str], input_unit: str = "V") -> dict[str, MetricColumn]:
-    """The columns of the metrics that were found, in their order; errors of other parameters than m, c, a, b first.
+    """The columns of metrics, in the order of tables; errors of parameters other than m, c, a, b come first.
 
     Args:
-        names: names.
-        input_unit: of the input; of a rig its own.
+        names: of metrics.
+        input_unit: unit of the input.
     """
     others = {name for name in names if name not in METRIC_COLUMNS}
     errors = {
@@ -116,8 +136,8 @@ def metric_columns(names: Iterable[str], input_unit: str = "V") -> dict[str, Met
     return errors | {name: metric for name, metric in columns.items() if name in names}
 
 
-def summarise_metrics(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[str, Any]]:
-    """The centre of each metric over systems, with its 95 % interval: `center_and_interval` by name."""
+def summarise_metrics(evaluation: Evaluation, seed: int = 0) -> dict[str, MetricSummary]:
+    """Name of each metric to its `center_and_interval` over systems."""
     columns = metric_columns(evaluation.metrics)
     return {
         name: center_and_interval(values.reshape(evaluation.seeds, -1), columns[name], seed)
@@ -125,17 +145,12 @@ def summarise_metrics(evaluation: Evaluation, seed: int = 0) -> dict[str, dict[s
     }
 
 
-def center_and_interval(values: FloatArray, metric: MetricColumn, seed: int = 0) -> dict[str, Any]:
+def center_and_interval(values: FloatArray, metric: MetricColumn, seed: int = 0) -> MetricSummary:
     """The centre of values (seeds, systems), with a 95 % bootstrap interval (percentile, 2000 resamples).
 
-    Over several training seeds the bootstrap is stratified: in every resample each seed has as many systems as it was
-    evaluated on. They are the same for all seeds, as the seeds were evaluated on the same ones, which are not
-    independent of each other. So the interval is that of these policies over systems; what another training would
-    give is in the spread of ``seeds``.
-
-    Returns:
-        The centre by its name, ``low`` and ``high``; of several seeds also ``seeds``, the metric's centre for each, and
-        ``median_of_seeds``.
+    Over several training seeds the same systems are resampled for all seeds, because the seeds were evaluated on the
+    same systems and are not independent. So the interval holds for these policies over systems; the variation between
+    trainings is in ``seeds``.
     """
     statistic_name, statistic = metric.center if len(values) == 1 else metric.center_of_seeds
 
@@ -149,14 +164,18 @@ def center_and_interval(values: FloatArray, metric: MetricColumn, seed: int = 0)
     else:
         with np.errstate(invalid="ignore"):  # values may be infinite, and SciPy takes their standard deviation
             interval = stats.bootstrap(
-                (np.arange(values.shape[1]),), resampled, n_resamples=_N_RESAMPLES, method="percentile", vectorized=True,
+                (np.arange(values.shape[1]),),
+                resampled,
+                n_resamples=_N_RESAMPLES,
+                method="percentile",
+                vectorized=True,
                 rng=np.random.default_rng(seed),
-            ).confidence_interval  # fmt: skip
+            ).confidence_interval
         entry |= {"low": float(interval.low), "high": float(interval.high)}
     if len(values) > 1:
-        per_seed = [float(metric.center[1](row)) for row in values]
+        per_seed = [float(metric.center.function(row)) for row in values]
         entry |= {"median_of_seeds": float(np.median(per_seed)), "seeds": per_seed}
-    return entry
+    return cast(MetricSummary, entry)
 
 
 def center_and_interval_text(metric: MetricColumn, values: FloatArray) -> str:
@@ -164,16 +183,17 @@ def center_and_interval_text(metric: MetricColumn, values: FloatArray) -> str:
     return metric_cell(metric, center_and_interval(values[None], metric)).replace("\n", " ")
 
 
-def center_value(entry: dict[str, Any]) -> Any:
-    """The centre in what `center_and_interval` made, whatever it is called."""
-    return next(value for key, value in entry.items() if key in ("mean", "median", "iqm"))
+def center_value(entry: MetricSummary) -> float:
+    """The centre in a summary, by whichever statistic.
 
-
-def metric_cell(metric: MetricColumn, entry: dict[str, Any] | None) -> str:
-    """What a table says of a metric: its centre, its interval on the next line, then the median of seeds, of several.
-
-    A dash where there is none.
+    Raises:
+        StopIteration: for a summary without one.
     """
+    return next(float(entry[name]) for name in ("mean", "median", "iqm") if name in entry)
+
+
+def metric_cell(metric: MetricColumn, entry: MetricSummary | None) -> str:
+    """A cell of a table: centre, interval on the next line, then the median of several seeds; a dash for None."""
     if entry is None:
         return "-"
     text = metric.format_value

@@ -1,4 +1,4 @@
-"""What is asked to be evaluated: policies and groups of them, what they are called, and whether they can play."""
+"""Policies and groups of training seeds in an evaluation: their titles, and checks that they can play."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from agents.user_code import attribute_user_errors
 
 
 def policy_title(policy: Any) -> str:
-    """What a policy is called in tables."""
+    """The title of a policy in tables."""
     if isinstance(policy, str):
         return policy
     known = getattr(policy, "name", None) or getattr(policy, "__name__", None) or type(policy).__name__
@@ -23,7 +23,11 @@ def policy_title(policy: Any) -> str:
 
 
 def policy_group(policy: Any) -> tuple[str | None, list[Any]]:
-    """The title of a group and the policies in it; without a title, the one policy of this name."""
+    """The title and the members of a group TITLE=PATTERN; a single policy has the title None.
+
+    Raises:
+        ValueError: for a pattern that matches fewer than two policy folders.
+    """
     if not isinstance(policy, str):
         return None, [policy]
     title, equals, pattern = policy.partition("=")
@@ -39,7 +43,7 @@ def policy_group(policy: Any) -> tuple[str | None, list[Any]]:
 
 
 def check_policies_can_play(policies: Sequence[Any], env_id: str, options: dict[str, Any], seed: int) -> None:
-    """Refuse policies that cannot be made for an environment, before the first of them plays: that takes a while."""
+    """Refuse policies that cannot be made for an environment, before the first one plays, which takes long."""
     envs = make_track_batch(env_id, 2, options)
     for policy in policies:
         if isinstance(policy, str):
@@ -53,10 +57,10 @@ def check_policies_can_play(policies: Sequence[Any], env_id: str, options: dict[
 
 
 def check_predict_signature(policy: Any, name: Any) -> None:
-    """Refuse a policy of one's own whose ``predict`` takes other arguments than it is called with."""
+    """Refuse a policy object whose ``predict`` cannot be called with the arguments of `agents.Policy`."""
     try:
         signature = inspect.signature(policy.predict)
-    except ValueError:  # that of a builtin is not known
+    except ValueError:  # a builtin has no signature
         return
     try:
         signature.bind(None, None, None, deterministic=True)

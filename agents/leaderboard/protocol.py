@@ -1,6 +1,6 @@
-"""The protocol: one way to say what a policy is worth on a track, so that figures of different people compare.
+"""The evaluation protocol: one score of a policy on a track, comparable between users, as an entry of a leaderboard.
 
-docs/protocol.md is the page for its users. What is measured goes into an entry of a board (`agents.leaderboard.leaderboard_file`).
+docs/protocol.md is its documentation; `agents.leaderboard.leaderboard_file` stores the entries.
 """
 
 from __future__ import annotations
@@ -10,55 +10,94 @@ import inspect
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
-from agents.evaluation.metric_summary import IQM, METRIC_COLUMNS, MetricColumn, center_and_interval
+from agents.evaluation.metric_summary import IQM, METRIC_COLUMNS, MetricColumn, MetricSummary, center_and_interval
 from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.oracle import Oracle, TrackSystems
-from agents.evaluation.policy_evaluation import Evaluation, run_episodes
 from agents.evaluation.policy_groups import policy_group
+from agents.evaluation.policy_rollout import Evaluation, run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import TRAINED, trained_policies
 from agents.policies.networks.trained_policy import CARD_FILE, MAX_STEPS, WEIGHTS_FILE, training_steps_of
 from agents.result_files import package_versions
 from agents.user_code import load_object
+from duffing_env.experiment_config import SimulatedExperiment
 from estimator.support.argument_checks import check_integer
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
 
-#: Of the protocol: entries of another version do not compare.
+#: Version of the protocol: entries of different versions are not comparable.
 PROTOCOL_VERSION = 1
 
-#: Tracks with a stored oracle, which a score needs.
+#: Tracks of the protocol, which have a stored oracle for the score.
 PROTOCOL_TRACKS = tuple(
     f"duffing_env/{name}-v{n}" for n in (0, 1) for name in ("Short", "Amplitude", "Output", "Power")
 )
 
-#: Samples that a policy may learn from, by the name of the budget; what takes more is open.
+#: Name of a budget to its number of training samples; more samples are an open budget.
 TRAINING_BUDGETS = {"0.1M": 100_000, "1M": 1_000_000, "10M": 10_000_000}
 
-#: A last update that is begun within the budget may be finished.
+#: Factor by which a training may exceed its budget, because the last update may be finished.
 _BUDGET_TOLERANCE = 1.05
 
+#: Systems of an evaluation.
 N_SYSTEMS = 256
+
+#: Seed of these systems.
 EVALUATION_SEED = 0
 
-#: The headline: share of what is possible.
+#: The score: D-efficiency.
 SCORE_COLUMN = MetricColumn("score / %", 1, 100, IQM, IQM)
 
-#: What stands beside it.
+#: Metrics of an entry, beside the score.
 REPORTED_METRICS = ("information_gain", "log_posterior_gain", "coverage", "ended_early", "decision_time")
+
+#: Metrics of an entry on each shifted test set.
 SHIFTED_METRICS = ("fisher_gain", "log_posterior_gain", "coverage", "ended_early")
 
 
+class Refusal(TypedDict):
+    """Message of a policy that does not play a shifted test set."""
+
+    refused: str
+
+
+class OracleReference(TypedDict):
+    """The oracle of a score: its digest, its number of systems, and how many of them have an upper bound."""
+
+    oracle: str
+    systems: int
+    certified: int
+
+
+class LeaderboardEntry(TypedDict):
+    """A measurement of a policy on a track, as a line of a leaderboard file holds it."""
+
+    name: str
+    track: str
+    protocol: int
+    samples: int
+    budget: str
+    seeds: int
+    score: MetricSummary
+    metrics: dict[str, MetricSummary]
+    shifted: dict[str, dict[str, MetricSummary] | Refusal]
+    reference: OracleReference
+    policies: dict[str, str]
+    command: list[str]
+    versions: dict[str, str]
+    date: str
+
+
 def shifted_test_sets(track: str) -> dict[str, tuple[str, dict[str, Any]]]:
-    """The shifted test sets of a track, by name: the environment and its options. What is believed is not told of them.
+    """The shifted test sets of a track, by name: track and options. The estimator's prior is not shifted.
 
     ``parameters``: oscillators from ± 50 % about the centre instead of ± 30 %. ``noises``: twice as strong as the
-    estimator is told or, where it is told none, as in training. ``limits``: of input and output, 0.8 of the track's.
-    ``equation``: the plant is the differential equation, and the estimator keeps the difference equation; of ``-v0``.
+    estimator's, or as in training where it estimates them. ``limits``: of input and output, 0.8 of the track's.
+    ``equation``, for ``-v0``: the plant is the differential equation, and the estimator keeps the difference equation.
     """
     import gymnasium as gym
 
@@ -82,24 +121,26 @@ def measure_policy(
     entry_name: str,
     training_samples: int | None = None,
     on_progress: ProgressCallback = ignore_progress,
-) -> dict[str, Any]:
-    """What a policy is worth by the protocol, as an entry of a board.
+) -> LeaderboardEntry:
+    """Measure a policy by the protocol; returns an entry of a leaderboard.
 
     Args:
-        policy: as of `agents.evaluation.policy_evaluation.evaluate_policies`; five training seeds of one recipe are TITLE=PATTERN.
+        policy: as of `agents.evaluation.policy_evaluation.evaluate_policies`; several training seeds of one
+            configuration are TITLE=PATTERN.
         track: one of `PROTOCOL_TRACKS`.
-        entry_name: that it has on the board.
-        training_samples: that it learned from; a run folder says it itself.
-        on_progress: is told the share that is done, and what is measured next (`estimator.support.progress.show_progress`).
+        entry_name: name on the leaderboard.
+        training_samples: number of samples of the training; a run folder holds it itself.
+        on_progress: called with the fraction that is done, and the present test set
+            (`estimator.support.progress.show_progress`).
 
     Raises:
-        ValueError: for another track, a missing name, samples that are no number of them, or something that is not a
+        ValueError: for another track, an empty name, a number of samples that is no whole number from 0, or an unknown
             policy.
     """
     if track not in PROTOCOL_TRACKS:
         raise ValueError(f"protocol must be one of {', '.join(PROTOCOL_TRACKS)}, but is {track}; others have no oracle")
     if not entry_name.strip():
-        raise ValueError("submit must be a name, but is empty; it is what the board shows")
+        raise ValueError("submit must be a name, but is empty; the board shows it")
     check_integer("samples", 0 if training_samples is None else training_samples, MAX_STEPS, 0)
     _, members = policy_group(policy)
     training_samples = max((_training_samples(member) or training_samples or 0 for member in members), default=0)
@@ -118,14 +159,14 @@ def measure_policy(
     evaluations = evaluate_members(track, TEST_OPTIONS, 0, f"{entry_name} on {track}")
     oracle = Oracle.of(TrackSystems.of(track, N_SYSTEMS))
     score = np.array([_efficiency_scores(evaluation, oracle) for evaluation in evaluations])
-    shifted: dict[str, Any] = {}
+    shifted: dict[str, dict[str, MetricSummary] | Refusal] = {}
     for k, (shift, (env_id, options)) in enumerate(shifts.items(), start=1):
         try:
             shifted_evaluations = evaluate_members(
                 env_id, TEST_OPTIONS | options, k * len(members), f"{entry_name}, shifted: {shift}"
             )
         except ValueError as error:
-            shifted[shift] = {"refused": str(error)}
+            shifted[shift] = Refusal(refused=str(error))
             continue
         shifted[shift] = _summarise_over_seeds(shifted_evaluations, SHIFTED_METRICS)
     return {
@@ -152,6 +193,7 @@ def measure_policy(
 
 def _evaluate_on_track(policy: str, env_id: str, options: dict[str, Any], on_progress: ProgressCallback) -> Evaluation:
     evaluation, _, truth, experiment = run_episodes(policy, env_id, N_SYSTEMS, EVALUATION_SEED, options, on_progress)
+    assert isinstance(experiment, SimulatedExperiment)
     evaluation.metrics["fisher_gain"] = fisher_information_gain(
         evaluation.inputs, truth, experiment, evaluation.outputs
     )
@@ -159,13 +201,13 @@ def _evaluate_on_track(policy: str, env_id: str, options: dict[str, Any], on_pro
 
 
 def _efficiency_scores(evaluation: Evaluation, oracle: Oracle) -> FloatArray:
-    """(n,) D-efficiency against the bound of each system that has one, else against the best input that is known."""
+    """D-efficiency (n,) relative to the upper bound of each system, or to the best known input where none is known."""
     n = len(oracle.values)
     efficiencies, lower_bounds = oracle.efficiency(evaluation.inputs.T[:n], np.swapaxes(evaluation.outputs, 0, 1)[:n])
     return np.where(np.isfinite(lower_bounds), lower_bounds, efficiencies)
 
 
-def _summarise_over_seeds(evaluations: list[Evaluation], names: tuple[str, ...]) -> dict[str, Any]:
+def _summarise_over_seeds(evaluations: list[Evaluation], names: tuple[str, ...]) -> dict[str, MetricSummary]:
     return {
         name: center_and_interval(
             np.array([evaluation.metrics[name] for evaluation in evaluations]), METRIC_COLUMNS[name]
@@ -175,28 +217,26 @@ def _summarise_over_seeds(evaluations: list[Evaluation], names: tuple[str, ...])
 
 
 def _budget_name(samples: int) -> str:
-    """The smallest budget that the samples are within; none for a policy that has not learned, else open."""
+    """Name of the smallest budget with this many samples; ``none`` for 0, ``open`` beyond the largest."""
     if not samples:
         return "none"
     return next((name for name, most in TRAINING_BUDGETS.items() if samples <= _BUDGET_TOLERANCE * most), "open")
 
 
 def _policy_folder(policy: str) -> Path | None:
-    """The folder of a trained policy."""
+    """The folder of a trained policy; None for any other policy."""
     folder = TRAINED / policy if policy in trained_policies() else Path(policy)
     return folder if (folder / CARD_FILE).is_file() else None
 
 
 def _training_samples(policy: str) -> int | None:
-    """Samples that a trained policy learned from, by its card."""
+    """Number of training samples on the card of a trained policy; None for any other policy."""
     folder = _policy_folder(policy)
-    if folder is None:
-        return None
-    return training_steps_of(folder)
+    return None if folder is None else training_steps_of(folder)
 
 
 def policy_fingerprint(policy: str) -> str:
-    """What tells a policy from another of its name: of its weights, or its source; one of ours has the version."""
+    """Digest of a policy's weights or source file; empty for a policy of this package, whose version is known."""
     folder = _policy_folder(policy)
     if folder is not None:
         return file_digest(folder / WEIGHTS_FILE)
@@ -204,12 +244,12 @@ def policy_fingerprint(policy: str) -> str:
         policy_object = load_object(policy, "policy")
         try:
             source = inspect.getsourcefile(policy_object)
-        except TypeError:  # an object, whose class it is that has a source
+        except TypeError:  # an object has the source of its class
             source = inspect.getsourcefile(type(policy_object))
         return "" if source is None else file_digest(Path(source))
     return ""
 
 
 def file_digest(path: Path) -> str:
-    """Of a file's content."""
+    """SHA-256 digest of a file."""
     return f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"

@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from agents.evaluation.policy_evaluation import run_episodes
+from agents.evaluation.policy_rollout import run_episodes
 from agents.policies.networks.policy_saving import write_policy
 from agents.policies.networks.trained_policy import CARD_FILE
 from estimator.support.file_io import write_atomically

@@ -165,7 +165,8 @@ def _checked_option_ranges(config: TrainConfig) -> dict[str, list[float]]:
     check_mapping("vary", config.vary)
     if config.env == FAMILY or not config.hyperparameters.features or config.reward not in INFORMATION_REWARDS:
         raise ValueError(
-            f"vary needs a track, features and a reward of {', '.join(INFORMATION_REWARDS)}, but env is {config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
+            f"vary needs a track, features and a reward of {', '.join(INFORMATION_REWARDS)}, but env is "
+            f"{config.env}, features {config.hyperparameters.features}, reward {config.reward}; leave vary out"
         )
     if (num_envs := config.hyperparameters.num_envs) % LANES:
         raise ValueError(

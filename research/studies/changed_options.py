@@ -21,9 +21,10 @@ from agents.cli import run_script
 from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.metric_summary import METRIC_COLUMNS, center_and_interval_text
 from agents.evaluation.metrics import fisher_information_gain
-from agents.evaluation.policy_evaluation import run_episodes
+from agents.evaluation.policy_rollout import run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.result_files import write_json
+from duffing_env.experiment_config import SimulatedExperiment
 from estimator.support.progress import iterate_with_progress
 
 #: What is compared: a title, the track without its version, the options.
@@ -73,7 +74,7 @@ def compare_with_planner(
     best = None
     for policy in (PLANNER, *policies):
         played, _, truth, experiment = run_episodes(policy, track, systems, 0, TEST_OPTIONS | options)
-        assert experiment.plant is not None
+        assert isinstance(experiment, SimulatedExperiment)
         information_gained = fisher_information_gain(played.inputs, truth, experiment, played.outputs)
         best = information_gained if best is None else best
         efficiency = np.exp(2.0 * (information_gained - best) / experiment.plant.n_coefficients)

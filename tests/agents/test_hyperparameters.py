@@ -121,7 +121,7 @@ def test_a_search_stays_within_the_hyperparameters(kind):
 
     Trial.suggest_int = lambda self, name, low, high, log=False, step=1: self.suggest_float(name, low, high)
     for end in (0, 1):
-        found = kind.suggest(Trial(end))
+        found = kind.sample_hyperparameters(Trial(end))
         assert len(found) >= 5
         assert parse_hyperparameters(kind, found) != kind()
     assert {"learning_rate", "gamma"} < set(found) < {f.name for f in fields(kind)}

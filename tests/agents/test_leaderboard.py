@@ -27,7 +27,7 @@ from agents.evaluation.figures import (
     save_png,
 )
 from agents.evaluation.metric_summary import METRIC_COLUMNS, summarise_metrics
-from agents.evaluation.policy_evaluation import Evaluation
+from agents.evaluation.policy_rollout import Evaluation
 from estimator import SILVERBOX_SAMPLING_STEP
 from estimator.rigs.units import VOLT_SCALES, Scales
 

@@ -94,7 +94,7 @@ def test_a_run_says_what_it_varied_and_goes_on(tmp_path):
         ({"vary": {"max_rms": [0.1, float("nan")]}}, r"vary\['max_rms'\]"),
         ({"vary": [16, 64]}, "vary must be a dictionary"),
         ({"options": {"horizon": 32}}, "both have horizon"),
-        ({"reward": "max_rms"}, "vary needs a track, features and a reward that counts information"),
+        ({"reward": "max_rms"}, "vary needs a track, features and a reward of information_gain"),
         ({"env": "family"}, "vary needs a track"),
         ({"hyperparameters": PPOSettings(num_envs=LANES, features=False)}, "features False"),
         ({"hyperparameters": PPOSettings(num_envs=LANES + 1)}, f"take {2 * LANES}"),

@@ -126,7 +126,7 @@ def test_checkpoints_are_policies_on_the_way(runs):
 
 def test_the_curve_and_the_log_tell_the_same(runs):
     run = runs["first"]
-    steps, seconds, returns = np.array(run.curve).T
+    steps, seconds, returns = np.array(run.curve, dtype=float).T
     np.testing.assert_array_equal(steps, [4096, 8192, 12288, 16384, 20480])
     assert np.all(np.diff(seconds) > 0)
     assert 0 < seconds[0] < seconds[-1] < run.seconds
@@ -146,7 +146,7 @@ def test_reward_and_options_reach_the_environment(tmp_path, monkeypatch):
             super().__init__(*arguments, **options)
             made.append(self)
 
-    monkeypatch.setattr(agents.sb3_vec_env, "DuffingVecEnv", Spy)
+    monkeypatch.setattr("agents.training.environments.training_envs.DuffingVecEnv", Spy)
     run = tiny(tmp_path / "run", reward="parameter_error", options={"horizon": 8, "max_output": 3.0, "spread": 0.1})
     envs, examples = made  # these show how the features vary
     assert examples.envs.experiment.horizon == 8
@@ -334,8 +334,8 @@ def test_sac_beats_signals_that_do_not_look(tmp_path):
 @pytest.mark.parametrize("begin", [train, lambda config: resume(config.output)], ids=["train", "resume"])
 def test_a_folder_that_another_trains_in_is_refused_untouched(tmp_path, begin):
     (tmp_path / "run").mkdir()
-    holds = "import sys; from pathlib import Path; from estimator.support.file_io import hold\n"
-    holds += "hold('output', Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    holds = "import sys; from pathlib import Path; from estimator.support.file_io import lock_folder\n"
+    holds += "held = lock_folder('output', Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     words = [sys.executable, "-c", holds, tmp_path / "run"]
     other = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert other.stdout.readline() == "held\n"

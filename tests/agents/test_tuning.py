@@ -11,6 +11,7 @@ import agents.commands.train_command
 from agents.commands.train_command import main
 from agents.interruption import Interrupted
 from agents.training import PPOSettings, TrainConfig, train, tune_hyperparameters
+from agents.training.heldout_evaluation import HeldOutScores
 from agents.training.hyperparameters import read_hyperparameters
 
 ENV = "duffing_env/Short-v0"
@@ -83,7 +84,7 @@ def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch, at
     """Also where it was killed between two of its hyperparameters."""
 
     def stand_in(run, report):
-        report(run.steps, {"log_posterior_gain": 1.0})
+        report(run.steps, HeldOutScores(0.0, 1.0, 0.9, 0.0))
 
     folder = tmp_path / "search"
     monkeypatch.setattr("agents.training.hyperparameter_search.train_or_resume", stand_in)
@@ -111,7 +112,7 @@ def test_trials_below_the_median_are_given_up(tmp_path, optuna, monkeypatch):
     def fake(run, report):
         score = -float(run.output.name)
         for steps in range(run.eval_every, run.steps + 1, run.eval_every):
-            report(steps, {"log_posterior_gain": score})
+            report(steps, HeldOutScores(0.0, score, 0.9, 0.0))
         ended.append(run.output.name)
 
     monkeypatch.setattr("agents.training.hyperparameter_search.train_or_resume", fake)

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from agents.evaluation.policy_evaluation import run_episodes
+from agents.evaluation.policy_rollout import run_episodes
 
 NOISE, SYSTEMS = 5e-4, 400  # V
 TRACKS = {

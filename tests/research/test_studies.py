@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation.metrics import fisher_information_gain
-from agents.evaluation.policy_evaluation import run_episodes
+from agents.evaluation.policy_rollout import run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import make_policy
 from research.studies import changed_options, iosmc_pendulum, sb3_baselines

@@ -196,7 +196,7 @@ def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
     for name in ("fast", "slow"):
         main(["design", str(tmp_path / f"{name}.toml"), "--policy", "prbs", "--samples", "16"])
         told = capsys.readouterr().err
-        assert ("the belief has 1.7 samples in a period; sample faster" in told) == (name == "slow")
+        assert ("has 1.7 samples in a period; sample faster" in told) == (name == "slow")
     # a = 110 to 180 N/m on about 1 kg: a period of 0.5 s.
     assert design_experiment(RIG, policy="prbs", samples=16).samples_per_period == pytest.approx(26, abs=1)
 
