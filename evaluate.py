@@ -1,4 +1,4 @@
-"""``duffing-env evaluate`` without an installation: python evaluate.py --help."""
+"""Run ``duffing-env evaluate`` without an installation: python evaluate.py --help."""
 
 from agents.cli import run_script
 from agents.commands.evaluate_command import EvaluateCommand

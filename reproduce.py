@@ -1,8 +1,8 @@
-"""Repeats the experiment of Kouw (2020) on the Silverbox record, or runs the Silverbox benchmark's official protocol.
+"""Repeat the experiment of Kouw (2020) on the Silverbox record, or run the official Silverbox benchmark protocol.
 
 $ python reproduce.py                     the paper's experiment
 $ python reproduce.py silverbox           the official protocol
-$ python reproduce.py silverbox --select  other settings, without test data
+$ python reproduce.py silverbox --select  compare settings, without test data
 """
 
 import sys
@@ -17,24 +17,24 @@ class Config:
     """Repeat the experiment of Kouw (2020) on the Silverbox record and compare with its published numbers."""
 
     json: Path | None = None
-    """File for the results, machine-readable."""
+    """JSON file for the results."""
     figures: Path = Path("runs/reproduction")
-    """Folder for the paper's two figures of errors, as PNG."""
+    """Folder for the paper's two figures of errors (PNG)."""
     data: Path | None = None
-    """The record: SNLS80mV.csv or SNLS80mV.mat, or their folder. Searched for on this machine if not given."""
+    """SNLS80mV.csv or SNLS80mV.mat, or their folder; searched on this machine if not given."""
 
 
 @dataclass(frozen=True)
 class Silverbox(Config):
-    """Run the official protocol of the Silverbox benchmark, for every estimator of this project.
+    """Run the official protocol of the Silverbox benchmark with every estimator of this project.
 
-    `python -m benchmarks.silverbox_comparison` puts other packages beside them.
+    `python -m benchmarks.silverbox_comparison` compares other packages.
     """
 
     figures: Path = Path("runs/silverbox")
-    """Folder for the figures of errors, learning and parameters, as PNG."""
+    """Folder for the figures of errors, learning curves and parameters (PNG)."""
     select: bool = False
-    """Print what other settings give on the last quarter of the training section, and do nothing else."""
+    """Only print the errors of other settings on the last quarter of the training section."""
 
 
 def main(config: Config) -> None:

@@ -1,4 +1,4 @@
-"""``duffing-env train`` without an installation: python train.py --help."""
+"""Run ``duffing-env train`` without an installation: python train.py --help."""
 
 from agents.commands.train_command import main
 

@@ -1,7 +1,7 @@
-"""Who chooses the input: excitation signals, learned policies, training and evaluation; and the commands.
+"""Policies that choose the input, their training and evaluation, experiments on hardware, and the commands.
 
-What it offers is listed in ``__init__.pyi``. Each is imported when it is asked for: a command that plays no policy does
-not wait for them.
+The public names are in ``__init__.pyi``. Each is imported at its first use, so that commands without policies start
+fast.
 """
 
 import lazy_loader

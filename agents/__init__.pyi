@@ -1,4 +1,4 @@
-# The names of `agents`, for type checkers and for its `__init__.py`, which fetches each when it is asked for.
+# Public names of `agents`, for type checkers and for `__init__.py`, which imports each at its first use.
 from .policies import POLICIES, Policy, make_policy
 from .policies.networks.policy_saving import save_policy
 

@@ -1,4 +1,4 @@
-"""What the command lines share: those of the scripts, and of ``duffing-env``."""
+"""Command lines of the scripts and of ``duffing-env``: parsing, errors in one line, and output in any encoding."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from agents.interruption import Interrupted, raise_on_sigterm
 Config = TypeVar("Config")
 
 
-#: What letters become that an encoding has not; others lose their accents, or become question marks.
+#: Replacements of letters that an encoding does not have; other letters lose their accents or become "?".
 _ASCII_SUBSTITUTES = {
     "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "·": "*", "×": "x", "±": "+/-", "−": "-", "–": "-", "—": "-",
     "…": "...",
@@ -35,7 +35,7 @@ _ASCII_SUBSTITUTES = {
 
 
 def _encode_error_handler(error: UnicodeError) -> tuple[str, int]:
-    """What stands for letters that a stream cannot write."""
+    """Replace letters that a stream cannot encode."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     letters = error.object[error.start : error.end]
@@ -43,7 +43,7 @@ def _encode_error_handler(error: UnicodeError) -> tuple[str, int]:
 
 
 def _ascii_form(letter: str) -> str:
-    if letter in _ASCII_SUBSTITUTES or "\u2500" <= letter <= "\u257f":  # lines of boxes
+    if letter in _ASCII_SUBSTITUTES or "\u2500" <= letter <= "\u257f":  # box drawing
         return _ASCII_SUBSTITUTES.get(letter, "+")
     plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
     return plain or "?"
@@ -54,7 +54,7 @@ codecs.register_error("legible", _encode_error_handler)
 
 @contextmanager
 def _terminal_output() -> Iterator[None]:
-    """Print lines of 80 characters at most, and letters in any encoding."""
+    """Limit lines to 80 characters, and let every letter be printed in any encoding."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="legible")
@@ -69,7 +69,7 @@ def _terminal_output() -> Iterator[None]:
 
 
 def parse_arguments(settings_class: Any, **options: Any) -> Any:
-    """What `tyro.cli` makes of the words; its help in lines of 80 characters, which it breaks only within boxes."""
+    """Parse arguments by `tyro.cli`; the help is printed in lines of at most 80 characters."""
     captured = io.StringIO()
     try:
         with redirect_stdout(captured):
@@ -81,15 +81,15 @@ def parse_arguments(settings_class: Any, **options: Any) -> Any:
 
 @contextmanager
 def one_line_errors(program_name: str) -> Iterator[None]:
-    """End the process where the user can mend what went wrong, with one message and no traceback.
+    """End the process with a message of one line and no traceback, after an error that the user can correct.
 
-    The exit status is 2 for a bad value or file, or a package of an extra that is missing; 130 after Ctrl-C, and 143
-    after SIGTERM.
+    The exit status is 2 for a bad value or file, or a missing package of an extra; 130 after Ctrl-C, and 143 after
+    SIGTERM.
 
     Args:
-        program_name: of the command, which stands before the message.
+        program_name: stands before the message.
     """
-    # At the end of the process Python looks through all that Numba and torch have built, which takes 0.1 s and more.
+    # Without this, a garbage collection over the objects of Numba and torch takes 0.1 s or more at the exit.
     atexit.register(gc.freeze)
     try:
         with raise_on_sigterm(), _terminal_output():
@@ -118,13 +118,13 @@ def one_line_errors(program_name: str) -> Iterator[None]:
 
 
 def run_script(main: Callable[[Config], object], config: type[Config], description: str | None = None) -> None:
-    """Parse the command line into ``config`` and call ``main`` with it, `one_line_errors` where that fails.
+    """Parse the command line into ``config`` and call ``main`` with it, within `one_line_errors`.
 
     Args:
-        main: what the script does.
-        config: its settings, a dataclass.
-        description: stands above the list of settings in the help; lines that begin with $ stay so. The docstring of
-            ``config`` where it is None.
+        main: function of the script.
+        config: dataclass of its settings.
+        description: above the settings in the help, where lines that begin with $ stay as they are; None: the docstring
+            of ``config``.
     """
     with one_line_errors(Path(sys.argv[0]).name):
         main(parse_arguments(config, description=description))

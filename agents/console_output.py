@@ -1,18 +1,28 @@
-"""How results are printed and written: tables, JSON files, and the versions that they were made with."""
+"""Printing of wrapped texts, warnings and tables on a terminal."""
 
 from __future__ import annotations
 
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from estimator.support.argument_checks import mask_control_codes
 from estimator.support.progress import MAX_LINE_WIDTH
 
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
-def rich_console() -> Any:
-    """Of rich, as wide as the terminal, but at most `WIDTH`."""
+#: Width in which the width of a table is measured [characters].
+_UNBOUNDED_WIDTH = 10_000
+
+#: Largest width of a label [characters].
+_MAX_LABEL_WIDTH = 32
+
+
+def rich_console() -> Console:
+    """A console of rich, as wide as the terminal, but at most `MAX_LINE_WIDTH`."""
     from rich.console import Console
 
     made = Console(highlight=False, markup=False, emoji=False)
@@ -21,7 +31,7 @@ def rich_console() -> Any:
 
 
 def print_wrapped(text: str, file: TextIO | None = None) -> None:
-    """Print a text in lines of at most `WIDTH` characters; a word that is longer, such as a path, stays whole."""
+    """Print a text in lines of at most `MAX_LINE_WIDTH` characters; a longer word, such as a path, is not broken."""
     for line in mask_control_codes(text, "\n").split("\n"):
         whole = textwrap.wrap(line, MAX_LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
         print("\n".join(whole), file=file)
@@ -32,8 +42,8 @@ def print_warning(text: str) -> None:
     print_wrapped(f"duffing-env: warning: {text}", sys.stderr)
 
 
-def print_texts_and_tables(*parts: Any) -> None:
-    """Print texts, as `say` does, and tables (`format_table`)."""
+def print_texts_and_tables(*parts: str | list[Table]) -> None:
+    """Print texts (`print_wrapped`) and tables (`format_table`)."""
     for part in parts:
         if isinstance(part, str):
             print_wrapped(part)
@@ -51,24 +61,24 @@ def format_table(
     markdown: bool = False,
     title: str = "",
     n_labels: int = 1,
-) -> list[Any]:
-    """A table of texts for `print_texts_and_tables`: the first column to the left, the others to the right, titles broken before cells.
+) -> list[Table]:
+    """A table of texts for `print_texts_and_tables`: the first column left-aligned, the others right-aligned.
 
-    Where it is wider than `WIDTH`, there are several, which begin with the same columns.
+    A table wider than `MAX_LINE_WIDTH` is split into several, which begin with the same columns.
 
     Args:
         headings: of the columns.
-        rows: their cells; a shorter row ends with empty ones.
-        markdown: whether the manual is to take the table as it is.
+        rows: cells of the rows; a shorter row is filled with empty cells.
+        markdown: whether to format the table as Markdown.
         title: above the table.
-        n_labels: columns that say what a row is, and stand in each of several tables.
+        n_labels: number of first columns that name a row, and are in each of several tables.
     """
     from rich.box import MARKDOWN, SIMPLE_HEAD
     from rich.table import Table
 
     cells = [[mask_control_codes(cell, "\n") for cell in row] + [""] * (len(headings) - len(row)) for row in rows]
 
-    def make_table(columns: Sequence[int]) -> Any:
+    def make_table(columns: Sequence[int]) -> Table:
         rich_table = Table(
             box=MARKDOWN if markdown else SIMPLE_HEAD, show_edge=markdown, padding=(0, 1) if markdown else (0, 1, 0, 0),
             title=title or None,
@@ -90,13 +100,13 @@ def format_table(
     return split_to_width(make_table, len(headings), n_labels)
 
 
-def split_to_width(make_table: Callable[[Sequence[int]], Any], n_columns: int, n_labels: int = 1) -> list[Any]:
-    """Tables of rich, each at most `WIDTH` wide, in place of one.
+def split_to_width(make_table: Callable[[Sequence[int]], Table], n_columns: int, n_labels: int = 1) -> list[Table]:
+    """Split a table into several, each at most `MAX_LINE_WIDTH` wide.
 
     Args:
-        make_table: the table of some columns.
-        n_columns: of the whole table.
-        n_labels: the first columns, which each table has.
+        make_table: makes the table of some columns.
+        n_columns: number of columns of the whole table.
+        n_labels: number of first columns, which each table has.
     """
     from rich.console import Console
     from rich.measure import Measurement
@@ -114,7 +124,3 @@ def split_to_width(make_table: Callable[[Sequence[int]], Any], n_columns: int, n
     for earlier in tables[:-1]:
         earlier.caption = None
     return tables
-
-
-#: Of what is measured, and of a label [characters].
-_UNBOUNDED_WIDTH, _MAX_LABEL_WIDTH = 10_000, 32

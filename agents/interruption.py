@@ -1,4 +1,4 @@
-"""Signals that end a run, or a command, in order: the input is zeroed, and what was measured or learned is kept."""
+"""Handling of SIGINT, SIGTERM and SIGHUP: a run or a training ends in order, and its data are kept."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-#: What ends a run. After a signal the command's exit status is 128 + its number.
+#: Signals that end a run; the exit status of the command is then 128 + the signal's number.
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-#: A call that a signal finds the program in is left by force after so many seconds.
+#: Time after a signal at which a call that has not returned is interrupted [s].
 _CALL_PATIENCE = 1.0
 
 
 class Interrupted(BaseException):
-    """A signal came.
+    """A signal interrupted the work.
 
     Args:
-        signum: its number.
-        resume_hint: what is left of the work, and how to go on.
+        signum: number of the signal.
+        resume_hint: how to go on with the work.
     """
 
     def __init__(self, signum: int, resume_hint: str = "") -> None:
@@ -32,14 +32,14 @@ class Interrupted(BaseException):
 class InterruptHandler:
     """Catches signals while it is entered, in the main thread.
 
-    A signal is noticed by `raise_if_interrupted`, between two commands to the plant, so that none is cut in two. A command or a
-    policy that does not come back within ``patience`` seconds is interrupted.
+    `raise_if_interrupted` notices a signal between two commands to a plant, so that no command is cut in two. A command
+    or a policy that does not return within ``patience`` seconds after a signal is interrupted.
     """
 
     def __init__(self, patience: float = _CALL_PATIENCE) -> None:
         self._patience = patience
         self._signum: int | None = None
-        self._old_handlers: dict[int, Any] = {}
+        self._old_handlers: dict[int, signal.Handlers | Callable[[int, FrameType | None], Any] | int | None] = {}
 
     def __enter__(self) -> InterruptHandler:
         if threading.current_thread() is threading.main_thread():
@@ -59,13 +59,13 @@ class InterruptHandler:
         return self._signum is not None
 
     def raise_if_interrupted(self, resume_hint: str = "") -> None:
-        """Raise `Interrupted` where a signal came; ``resume_hint`` says what is left."""
+        """Raise `Interrupted` with this hint where a signal came."""
         if self._signum is not None:
             self._cancel_timer()
             raise Interrupted(self._signum, resume_hint)
 
     def ignore_signals(self) -> None:
-        """From now on no signal is noticed: the input is being zeroed."""
+        """Ignore signals from now on, while the input is being zeroed."""
         self._cancel_timer()
         for signum in self._old_handlers:
             signal.signal(signum, signal.SIG_IGN)
@@ -86,7 +86,7 @@ class InterruptHandler:
 
 @contextmanager
 def add_resume_hint(make_hint: Callable[[str], str]) -> Iterator[None]:
-    """Let a signal that ends the work within say what is left of it: ``make_hint`` makes that of what is said already."""
+    """Add a hint to the `Interrupted` of the work within; ``make_hint`` gets the hint that it has already."""
     try:
         yield
     except (KeyboardInterrupt, Interrupted) as interruption:
@@ -100,7 +100,7 @@ def add_resume_hint(make_hint: Callable[[str], str]) -> Iterator[None]:
 
 @contextmanager
 def raise_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM raise `Interrupted`, as Ctrl-C raises KeyboardInterrupt, in the main thread, which alone is told."""
+    """Let SIGTERM raise `Interrupted` in the main thread, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(signum: int, frame: FrameType | None) -> None:
         raise Interrupted(signum)

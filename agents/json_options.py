@@ -9,7 +9,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 
 def _parse_json_options(arguments: list[str]) -> dict[str, Any]:
-    """The JSON object that the first of the words holds; ValueError where it is not one."""
+    """Parse the first argument as a JSON object; ValueError for anything else, or a name that the command sets."""
     try:
         options = json.loads(arguments[0])
     except RecursionError:
@@ -18,11 +18,11 @@ def _parse_json_options(arguments: list[str]) -> dict[str, Any]:
         raise ValueError(f"options must be a JSON object, but are {arguments[0]}; write e.g. '{{\"spread\": 0.2}}'")
     for name in ("num_envs", "autoreset_mode", "max_episode_steps", "threads", "copy", "render_mode"):
         if name in options:
-            raise ValueError(f"options must not hold {name}, but are {arguments[0]}; the command chooses that itself")
+            raise ValueError(f"options must not hold {name}, but are {arguments[0]}; the command sets it itself")
     return options
 
 
-#: A dictionary that is written as JSON on the command line: '{"spread": 0.2}'.
+#: A dictionary that is JSON on the command line: '{"spread": 0.2}'.
 JsonOptions = Annotated[
     dict[str, Any],
     PrimitiveConstructorSpec(

@@ -9,11 +9,11 @@ from estimator.support.file_io import check_writable
 
 
 def check_distinct_files(outputs: Mapping[str, Path | None], inputs: Iterable[str | Path]) -> None:
-    """Refuse to write over what a command reads, or two things into one file.
+    """Refuse an output that is also an input, and two outputs in one file.
 
     Args:
-        outputs: option to the file that it names, or None.
-        inputs: files that the command reads; names of rigs that ship do no harm.
+        outputs: option to its file, or None.
+        inputs: files that the command reads; names of shipped rigs may be among them.
 
     Raises:
         ValueError: naming the option.
@@ -23,13 +23,13 @@ def check_distinct_files(outputs: Mapping[str, Path | None], inputs: Iterable[st
         if path is not None:
             if path.resolve() in reasons:
                 raise ValueError(
-                    f"{name} must be a file of its own, but is {path}, and {reasons[path.resolve()]}; name another"
+                    f"{name} must be a separate file, but is {path}, and {reasons[path.resolve()]}; name another"
                 )
             reasons[path.resolve()] = f"so is {name}"
 
 
 def check_not_overwritten(name: str, path: Path | None, force: bool) -> None:
-    """Refuse to replace a file that is there, but by force: it may be a measurement.
+    """Refuse to replace an existing file, which may be a measurement, unless ``force`` is set.
 
     Raises:
         ValueError: naming the option.
@@ -39,7 +39,7 @@ def check_not_overwritten(name: str, path: Path | None, force: bool) -> None:
 
 
 def check_output_file(name: str, path: Path | None) -> None:
-    """Refuse a folder where a file is to be written, and where none can be, before the work begins.
+    """Refuse an output file that is a folder or cannot be written, before the work begins.
 
     Raises:
         IsADirectoryError: naming the argument.
@@ -53,13 +53,13 @@ def check_output_file(name: str, path: Path | None) -> None:
 
 
 def check_output_folder(name: str, path: Path) -> None:
-    """Refuse a file where a folder is to be, and where none can be written to, before the work begins.
+    """Refuse an output folder that is a file or cannot be written to, before the work begins.
 
     Raises:
         NotADirectoryError: naming the argument.
-        OSError: naming the path, where nothing can be written.
+        OSError: naming the path, where it cannot be written to.
     """
     for place in (path, *path.parents):
         if place.exists() and not place.is_dir():
-            raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another place")
+            raise NotADirectoryError(f"{name} must be a folder, but {place} is a file; name another folder")
     check_writable(path)

@@ -14,10 +14,10 @@ from estimator.support.file_io import write_atomically
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file in one piece; a number that is not finite, as null.
+    """Write a JSON file in one piece, with null for every number that is not finite.
 
     Raises:
-        OSError: where it cannot be written.
+        OSError: where the file cannot be written.
     """
     write_atomically(
         path, json.dumps(replace_non_finite(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -25,7 +25,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def replace_non_finite(content: Any) -> Any:
-    """What JSON can hold: a number that is not finite becomes null."""
+    """The content with None for every number that is not finite, which JSON cannot hold."""
     if isinstance(content, dict):
         return {key: replace_non_finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
@@ -33,10 +33,10 @@ def replace_non_finite(content: Any) -> Any:
     return None if isinstance(content, float) and not np.isfinite(content) else content
 
 
-#: What the numbers of a result depend on.
+#: Packages on which the numbers of a result depend.
 VERSIONED_PACKAGES = ("duffing-env", "gymnasium", "numpy", "numba", "scipy")
 
 
 def package_versions(*packages: str) -> dict[str, str]:
-    """Of Python, of `VERSIONED_PACKAGES`, and of these packages."""
+    """Versions of Python, of `VERSIONED_PACKAGES`, and of these packages."""
     return {"python": platform.python_version(), **{name: version(name) for name in (*VERSIONED_PACKAGES, *packages)}}

@@ -6,15 +6,15 @@ from typing import Any
 
 from agents.user_code import env_spec_of
 
-#: The track of a rig.
+#: Id of the track of a rig.
 RIG_TRACK = "duffing_env/Rig-v0"
 
 
 def options_with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]:
-    """Options of an environment, with the rig of a file, or one that ships, written out.
+    """Add a rig, by its file or its name, to the options of an environment.
 
     Raises:
-        ValueError: for a file that is not a rig's.
+        ValueError: for a file that is no rig file.
         FileNotFoundError: if there is no such file.
     """
     if rig is None:
@@ -25,7 +25,7 @@ def options_with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]
 
 
 def full_track_id(env_id: Any) -> Any:
-    """The id of a track by its name, without the module that registers it; anything else as it is.
+    """The full id of a track, without the module that registers it; other ids stay as they are.
 
     Example:
         >>> full_track_id("Short-v0"), full_track_id("duffing_env:duffing_env/Short-v0"), full_track_id("CartPole-v1")
@@ -38,7 +38,7 @@ def full_track_id(env_id: Any) -> Any:
 
 
 def check_track_id(env_id: str) -> None:
-    """Refuse an environment that has no vector environment of duffing_env, on which everything here is run.
+    """Refuse an id that is no track: training and evaluation need a vector environment of duffing_env.
 
     Raises:
         ValueError: for an environment of another package, or one that cannot be imported.

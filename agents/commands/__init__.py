@@ -1,7 +1,7 @@
-"""``duffing-env``: the command for a user's own oscillator.
+"""The command ``duffing-env``: identify an oscillator, design and run experiments, train and evaluate policies.
 
-Each command is a module here: a dataclass of what it takes, whose docstring is its help, with a method ``run`` that
-imports what is heavy. To add one, put it into `COMMANDS`.
+Each command is a module here: a dataclass of its arguments, whose docstring is its help, with a method ``run`` that
+imports slow modules. A new command needs an entry in `COMMANDS`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from agents.commands.report_command import ReportCommand
 from agents.commands.rig_command import RigInitCommand, RigListCommand
 from agents.commands.run_command import RunCommand
 
+#: Stands before messages.
 COMMAND_NAME = "duffing-env"
 
 
@@ -29,12 +30,12 @@ class TrainPlaceholder:
     """Train a policy (PPO, SAC, TD3, TQC, recurrent PPO) on any track or rig."""
 
 
-#: What each command takes, by its name; commands of a group are under one.
+#: Name of a command to the class of its arguments; a group of commands has one name.
 COMMANDS: dict[str, Any] = {
     "identify": IdentifyCommand,
     "design": DesignCommand,
     "run": RunCommand,
-    "train": TrainPlaceholder,  # its settings follow from the algorithm: `agents.commands.train_command`
+    "train": TrainPlaceholder,  # its arguments depend on the algorithm: `agents.commands.train_command`
     "evaluate": EvaluateCommand,
     "export": ExportCommand,
     "report": ReportCommand,
@@ -42,11 +43,12 @@ COMMANDS: dict[str, Any] = {
     | Annotated[RigListCommand, tyro.conf.subcommand("list")],
 }
 
+#: Help of the group of commands ``rig``.
 _RIG_HELP = "Describe your rig in a file; list the rigs that ship."
 
 
 def _all_subcommands() -> Any:
-    """The commands, each with the first paragraph of its help: examples would be broken into several lines here."""
+    """The commands, each with the first paragraph of its help, without the examples."""
     descriptions = {
         name: _RIG_HELP if name == "rig" else (command.__doc__ or "").split("\n\n")[0]
         for name, command in COMMANDS.items()
@@ -62,10 +64,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Run a command.
 
     Args:
-        arguments: of the command line; those of this process where they are None.
+        arguments: of the command line; None: the arguments of this process.
 
     Raises:
-        SystemExit: with status 2 where a value or a file is bad, 130 after Ctrl-C, 143 after SIGTERM, and 1 where a run
+        SystemExit: with status 2 for a bad value or file, 130 after Ctrl-C, 143 after SIGTERM, and 1 for a run that
             ended early.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -82,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
                 COMMANDS[name], prog=f"{COMMAND_NAME} {name}", description=description, args=rest, config=config
             ).run()
         else:
-            description = "Identify an oscillator; choose the input that tells most. Each command has its own --help."
+            description = "Identify an oscillator; choose the most informative input. Each command has its own --help."
             parse_arguments(
                 _all_subcommands(), prog=COMMAND_NAME, description=description, args=arguments, config=config
             )

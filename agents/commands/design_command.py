@@ -1,17 +1,20 @@
-"""``duffing-env design``: the next experiment on a rig, as a signal."""
+"""``duffing-env design``: design the input signal of the next experiment on a rig."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+if TYPE_CHECKING:
+    from agents.hardware.next_experiment import ExperimentDesign
 
 
 @dataclass(frozen=True)
 class DesignCommand:
-    """Design the next experiment: a signal within the rig's limits, and the intervals to be expected after it.
+    """Design the next experiment: a signal within the rig's limits, and the intervals expected after it.
 
     $ duffing-env design rig.toml
     $ duffing-env design rig.toml posterior.npz -o next.csv --figure next.png
@@ -21,24 +24,24 @@ class DesignCommand:
     rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
     """Rig file, with input.limit and output.range, or the name of a rig that ships."""
     posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
-    """What is known: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
+    """Belief before: a file of identify --save, or estimator.npz of a run; by the rig's guess if not given."""
     policy: str = "efe"
-    """The planner, a signal, or a policy that ships."""
+    """efe (the planner), a signal, or a policy that ships."""
     samples: int = 256
-    """Of the experiment."""
+    """Samples of the experiment."""
     bound: float = 0.05
-    """Largest probability that the output leaves its range, under all that is believed."""
+    """Largest probability that the output leaves its range, under the belief."""
     seed: int = 0
-    """Of the policy, and of the systems that are drawn from what is believed."""
+    """Seed of the policy, and of the systems that are drawn from the belief."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
     """CSV file for the signal, in the rig's units."""
     figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Picture (PNG) of the signal, and of what the sensor is expected to show."""
+    """Picture (PNG) of the signal and of the predicted output."""
     force: bool = False
-    """Replace the files where there are some."""
+    """Replace existing files."""
 
     def run(self) -> None:
-        """Design, print what is to be expected, and write the signal."""
+        """Design, print the expected intervals, and write the signal."""
         from agents.console_output import print_wrapped
         from agents.hardware.next_experiment import design_experiment
         from agents.output_paths import check_distinct_files, check_not_overwritten
@@ -60,7 +63,7 @@ class DesignCommand:
             experiment_design = design_experiment(
                 self.rig, prior, self.policy, self.samples, self.bound, self.seed, on_progress
             )
-        # What is printed needs no file, and comes also where none can be written.
+        # The result is printed also where the files cannot be written.
         try:
             if self.output is not None:
                 experiment_design.write(self.output)
@@ -76,35 +79,40 @@ class DesignCommand:
             print_wrapped(f"The picture is {self.figure}")
 
 
-def print_experiment_design(experiment_design: Any) -> None:
-    """Print the intervals before and after, and how safe the signal is."""
+def print_experiment_design(design: ExperimentDesign) -> None:
+    """Print the intervals before and after, and the probability of leaving the range."""
     from agents.console_output import format_table, print_warning
     from agents.console_output import print_texts_and_tables as print_all
     from agents.hardware.next_experiment import undersampling_message
     from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD
     from estimator.rigs.units import digits_to_distinguish
 
-    # A mean that differs from 0 by rounding alone is 0.
-    rows = [
-        [
-            name,
-            f"{mean if abs(mean) > 1e-9 * (high - low) else 0.0:.{digits}g}",
-            f"{low:.{digits}g} to {high:.{digits}g}",
-            f"± {half_width:.2g}",
-            f"{(high - low) / 2 / half_width:.3g}",
-            unit,
-        ]
-        for name, mean, (low, high), half_width, unit in experiment_design.parameter_rows()
-        for digits in [digits_to_distinguish(low, high, 5)]
-    ]
-    description = f"{len(experiment_design.u)} samples by {experiment_design.policy}, up to {abs(experiment_design.u).max():.3g} {experiment_design.rig.input.unit}"
-    description += f", made smaller to {experiment_design.scale:.2g} of it" if experiment_design.scale < 1 else ""
+    rows = []
+    for row in design.parameter_rows():
+        low, high = row.interval
+        digits = digits_to_distinguish(low, high, 5)
+        mean = row.mean if abs(row.mean) > 1e-9 * (high - low) else 0.0  # 0 but for rounding
+        rows.append(
+            [
+                row.name,
+                f"{mean:.{digits}g}",
+                f"{low:.{digits}g} to {high:.{digits}g}",
+                f"± {row.expected_half_width:.2g}",
+                f"{(high - low) / 2 / row.expected_half_width:.3g}",
+                row.unit,
+            ]
+        )
+    description = f"{len(design.u)} samples by {design.policy}, up to {abs(design.u).max():.3g} {design.rig.input.unit}"
+    description += f", scaled by {design.scale:.2g} to be safe" if design.scale < 1 else ""
     print_all(
         format_table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),
-        f"{description}; {experiment_design.information_gain:.1f} nats more; out of the range with a probability of at most {experiment_design.exit_probability:.1g}.",
+        f"{description}; expected information gain {design.information_gain:.1f} nats; the output leaves its range "
+        f"with a probability of at most {design.exit_probability:.1g}.",
     )
-    if len(set(experiment_design.u.tolist())) == 1 and experiment_design.scale > 0:
-        message = f"every input is the same: {experiment_design.policy} holds its values for longer than {len(experiment_design.u)} samples here"
-        print_warning(f"{message}; choose another signal, or more samples")
-    if experiment_design.samples_per_period < MIN_SAMPLES_PER_PERIOD:
-        print_warning(undersampling_message(experiment_design.rig.step, experiment_design.samples_per_period))
+    if len(set(design.u.tolist())) == 1 and design.scale > 0:
+        print_warning(
+            f"every input is the same: {design.policy} holds its values for longer than {len(design.u)} samples "
+            "here; choose another signal, or more samples"
+        )
+    if design.samples_per_period < MIN_SAMPLES_PER_PERIOD:
+        print_warning(undersampling_message(design.rig.step, design.samples_per_period))

@@ -1,4 +1,4 @@
-"""``duffing-env evaluate``: policies compared."""
+"""``duffing-env evaluate``: compare policies, or measure one by the evaluation protocol."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from agents.json_options import JsonOptions
 from agents.track_ids import RIG_TRACK, check_track_id, full_track_id, options_with_rig
 
-#: What goes with a protocol.
+#: Options that may be given with ``protocol``.
 _PROTOCOL_OPTIONS = ("policies", "protocol", "submit", "samples", "board")
 
 
@@ -27,7 +27,7 @@ class EvaluateCommand:
     """
 
     policies: tuple[str, ...] = ()
-    """Names, run folders, module:name, TITLE=PATTERN for folders of seeds; what ships and the planner if none."""
+    """Names, run folders, module:name, or TITLE=PATTERN for folders of seeds; the default policies if none."""
     env: str | None = None
     """Track, such as Short-v0; Amplitude-v0 where it is not given."""
     rig: str | None = None
@@ -35,19 +35,19 @@ class EvaluateCommand:
     options: JsonOptions = field(default_factory=dict)
     """Further options of the environment, as JSON."""
     systems: int = 256
-    """Systems that every policy is evaluated on, the same for all."""
+    """Systems of the comparison, the same for every policy."""
     seed: int = 0
     """Seed of systems and noise."""
     output: Path = Path("runs/evaluation")
     """Folder for evaluation.json and the figures."""
     report: Path | None = None
-    """Folder for a report instead: one HTML page, and evaluation.json."""
+    """Folder for a report in place of figures: one HTML page, and evaluation.json."""
     protocol: str | None = None
-    """Track, such as Short-v0, to measure one policy on by docs/protocol.md instead, which fixes all but the policy."""
+    """Track, such as Short-v0, to measure one policy by docs/protocol.md, which fixes all other settings."""
     submit: str | None = None
     """Add the result to the board under this name."""
     samples: int | None = None
-    """Samples that the policy learned from, for the board; a run folder says it itself."""
+    """Training samples of the policy, for the board; a run folder holds them itself."""
     board: Path = Path("runs/leaderboard.jsonl")
     """File of the board."""
 
@@ -58,14 +58,14 @@ class EvaluateCommand:
         if self.protocol is not None and len(self.policies) != 1:
             raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")
         if self.protocol is None and self.submit is not None:
-            raise ValueError("submit goes with a protocol, but that is None; add e.g. --protocol Short-v0")
+            raise ValueError("submit goes with a protocol, but protocol is None; add e.g. --protocol Short-v0")
 
     @property
     def _track(self) -> str:
         return RIG_TRACK if self.rig is not None else full_track_id("Amplitude-v0" if self.env is None else self.env)
 
     def _check_protocol(self, track: str) -> None:
-        """Refuse what contradicts the protocol, and would not count."""
+        """Refuse settings that the protocol fixes."""
         given = replace(self, env=None) if full_track_id(self.env) == track else self
         defaults = asdict(EvaluateCommand())
         for name, value in asdict(given).items():
@@ -73,7 +73,7 @@ class EvaluateCommand:
                 raise ValueError(f"protocol fixes all but the policy, but {name} is {value}; leave it out")
 
     def run(self) -> None:
-        """Compare or measure, and say where everything is."""
+        """Compare or measure, and print where the files are."""
         if self.protocol is not None:
             self._run_protocol(self.protocol)
             return
@@ -100,7 +100,7 @@ class EvaluateCommand:
         with show_progress("Measuring") as on_progress:
             name = policy.partition("=")[0] if self.submit is None else self.submit
             entry = measure_policy(policy, track, name, self.samples, on_progress)
-        # What is printed needs no file, and comes also where none can be written.
+        # The result is printed also where the board cannot be written.
         try:
             if self.submit is not None:
                 append_entry(self.board, entry)

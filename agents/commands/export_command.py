@@ -1,4 +1,4 @@
-"""``duffing-env export``: an excitation as CSV, or the network of a policy as ONNX."""
+"""``duffing-env export``: write an excitation as CSV, or the network of a policy as ONNX."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ class ExportCommand:
     name: Annotated[str, tyro.conf.Positional]
     """Name of the excitation, or name or folder of a trained policy."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
-    """The file that is written; that of a policy ends in .onnx."""
+    """Output file; for a policy it ends in .onnx."""
     samples: int = 1024
-    """Its length."""
+    """Length of the excitation [samples]."""
     max_input: float = 0.15
-    """The amplitude limit in volts."""
+    """Amplitude limit [V]."""
     max_rms: float | None = None
-    """The largest root mean square in volts."""
+    """Largest root mean square [V]."""
     seed: int = 0
-    """Seed of the draw."""
+    """Seed of the excitation."""
     force: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
 
     def run(self) -> None:
-        """Write it, and say what it is."""
+        """Write the file, and print a summary."""
         import numpy as np
 
         from agents.console_output import print_wrapped
@@ -63,4 +63,4 @@ class ExportCommand:
         policy = load_policy(TRAINED / self.name if self.name in trained_policies() else self.name)
         export_network(policy, self.output)
         sizes = " to ".join(str(size) for size in (policy.layers[0][0].shape[1], *(len(b) for _, b in policy.layers)))
-        print_wrapped(f"{self.output}: {len(policy.layers)} layers, {sizes} numbers; the shield is no part of it")
+        print_wrapped(f"{self.output}: {len(policy.layers)} layers, {sizes} numbers; the shield is not in the file")

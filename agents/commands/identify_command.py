@@ -1,4 +1,4 @@
-"""``duffing-env identify``: parameters of a user's own oscillator, from records."""
+"""``duffing-env identify``: parameters of an oscillator with credible intervals, from records."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class IdentifyCommand:
-    """Identify m, c, a and b from records, with intervals, and warn where these do not hold.
+    """Identify m, c, a and b from records, with intervals, and warn where the intervals do not hold.
 
     $ duffing-env identify rig.toml data.csv
     $ duffing-env identify rig.toml monday.csv tuesday.csv --report out.html
@@ -32,14 +32,14 @@ class IdentifyCommand:
     ]
     """CSV or MAT files with the columns or variables u and y."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Write a page with figures here, which opens without a network."""
+    """File for a page with figures, which opens without a network."""
     save: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Write what is known now here, a NumPy archive (.npz), for duffing-env design, and estimator.load_estimator."""
+    """File for the belief, a NumPy archive (.npz), for duffing-env design, and estimator.load_estimator."""
     json: bool = False
     """Print JSON instead of the table."""
 
     def run(self) -> None:
-        """Identify, print, and write the page."""
+        """Identify, print, and write the files."""
         from agents.console_output import print_wrapped
         from agents.output_paths import check_distinct_files
         from estimator import identify
@@ -52,7 +52,7 @@ class IdentifyCommand:
             raise ValueError("data must name at least one CSV or MAT file; add it after the rig file")
         check_distinct_files({"save": self.save, "report": self.report}, [self.rig, *self.data])
         result = identify(self.rig, list(self.data), progress=True)
-        # What is printed needs no file, and comes also where none can be written.
+        # The result is printed also where the files cannot be written.
         try:
             if self.save is not None:
                 from estimator.saving import save_estimator
@@ -70,7 +70,7 @@ class IdentifyCommand:
 
 
 def result_to_dict(result: Result) -> dict[str, Any]:
-    """What the JSON holds."""
+    """The content of the JSON output."""
     units, intervals = result.units, result.interval(0.9)
     return {
         "parameters": {
@@ -94,7 +94,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 
 
 def sampling_step_sentences(result: Result) -> list[str]:
-    """Sentences: the sampling step that was taken, and where it is from."""
+    """Sentences with the sampling step of each record and its source."""
     steps_without_times = [one.step for one in result.records if one.times is None]
     agreement = (
         "and the times agree"
@@ -111,7 +111,8 @@ def sampling_step_sentences(result: Result) -> list[str]:
     for record in result.records:
         if record.times is not None and record.step is not None:
             sentences.append(
-                f"By its times {record.name.partition(', from sample ')[0]} has steps of {_format_sampling_step(record.step)}."
+                f"By its times {record.name.partition(', from sample ')[0]} has steps of "
+                f"{_format_sampling_step(record.step)}."
             )
     return list(dict.fromkeys(sentences))
 
@@ -121,7 +122,7 @@ def _format_sampling_step(step: float) -> str:
 
 
 def print_identification(result: Result) -> None:
-    """Print the sampling step, a table, and the warnings under it."""
+    """Print the sampling step, the table of parameters, and the warnings."""
     from rich.text import Text
 
     from agents.console_output import format_table, rich_console
@@ -137,10 +138,10 @@ def print_identification(result: Result) -> None:
         rows.append([name, value, f"{low:.{digits}g} to {high:.{digits}g}", units[name]])
     print_all(
         *sampling_step_sentences(result),
-        "m x'' + c x' + a x + b x³ = u - u0 + w, seen with the offset y0",
+        "m x'' + c x' + a x + b x³ = u - u0 + w, measured with the offset y0",
         format_table(("", "mean", "90 % interval", "unit"), rows),
     )
     for warning in result.warnings:
         rich_console().print(Text.assemble((warning.name, "bold red"), f": {mask_control_codes(warning.message)}"))
     if not result.warnings:
-        rich_console().print("No check speaks against this result.", style="green")
+        rich_console().print("No check contradicts this result.", style="green")

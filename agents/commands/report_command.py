@@ -1,4 +1,4 @@
-"""``duffing-env report``: boards as tables, and as a page."""
+"""``duffing-env report``: print the leaderboard, or write it as an HTML page."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class ReportCommand:
     """
 
     board: Path | None = None
-    """File of your own entries; runs/leaderboard.jsonl where there is one."""
+    """File of your own entries; runs/leaderboard.jsonl if it exists."""
     output: Path | None = None
-    """Write a page here, which opens without a network."""
+    """File for a page, which opens without a network."""
 
     def run(self) -> None:
         """Print the tables, and write the page."""
@@ -26,25 +26,22 @@ class ReportCommand:
         from agents.output_paths import check_distinct_files
 
         check_distinct_files({"output": self.output}, [self.board or leaderboard_file.OWN_LEADERBOARD])
-        own_leaderboard = (
-            self.board
-            if self.board is not None
-            else leaderboard_file.OWN_LEADERBOARD
-            if leaderboard_file.OWN_LEADERBOARD.is_file()
-            else None
-        )
-        entries = {
+        own_leaderboard = self.board
+        if own_leaderboard is None and leaderboard_file.OWN_LEADERBOARD.is_file():
+            own_leaderboard = leaderboard_file.OWN_LEADERBOARD
+        by_track_and_name = {
             (entry["track"], entry["name"]): entry
             for path in (leaderboard_file.SHIPPED_LEADERBOARD, own_leaderboard)
             if path
             for entry in leaderboard_file.read_entries(path)
         }
-        # What is printed needs no file, and comes also where none can be written.
+        entries = list(by_track_and_name.values())
+        # The tables are printed also where the page cannot be written.
         try:
             if self.output is not None:
-                leaderboard_tables.write_leaderboard_page(self.output, list(entries.values()))
+                leaderboard_tables.write_leaderboard_page(self.output, entries)
         finally:
-            for track, rows in leaderboard_tables.leaderboard_rows(list(entries.values())).items():
+            for track, rows in leaderboard_tables.leaderboard_rows(entries).items():
                 print_texts_and_tables(f"\n{track}", format_table(leaderboard_tables.COLUMN_TITLES, rows))
             print_texts_and_tables(leaderboard_tables.LEADERBOARD_CAPTION)
         if self.output is not None:

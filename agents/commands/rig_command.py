@@ -1,4 +1,4 @@
-"""``duffing-env rig``: describe a rig in a file, or list those that ship."""
+"""``duffing-env rig``: write a rig file, or list the rigs that ship."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import tyro
 
 @dataclass(frozen=True)
 class RigInitCommand:
-    """Write a rig file. It asks, or takes what a record tells, or copies a rig that ships.
+    """Write a rig file: by questions, from a record, or as a copy of a rig that ships.
 
     $ duffing-env rig init
     $ duffing-env rig init rig.toml --from data.csv
@@ -23,22 +23,20 @@ class RigInitCommand:
     """
 
     path: Annotated[Path, tyro.conf.Positional] = Path("rig.toml")
-    """The file that is written."""
+    """Output file."""
     source: Annotated[str | None, tyro.conf.arg(name="from", metavar="DATA|NAME")] = None
     """CSV or MAT file of a record, or the name of a rig that ships."""
     step: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Sampling step, for a record without a column of times, such as a MAT file."""
     input: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Column or variable of a record that holds the input, where its name is none of the usual."""
+    """Column or variable of the input in a record, where it has none of the usual names."""
     output: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The same of the output."""
+    """Column or variable of the output, likewise."""
     force: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
 
     def run(self) -> None:
-        """Write it."""
-        from agents.cli import check_not_overwritten
-        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record
+        """Write the file."""
         from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, to_toml
         from agents.console_output import print_wrapped
         from agents.output_paths import check_not_overwritten
@@ -59,7 +57,7 @@ class RigInitCommand:
         write_atomically(self.path, text)
         if summary:
             print_wrapped(summary)
-        print_wrapped(f"Wrote {self.path}: read it, and correct what is not so.")
+        print_wrapped(f"Wrote {self.path}: read it, and correct what is wrong.")
         data = "data.csv" if self.source is None or self.source in SHIPPED_RIGS else self.source
         print_wrapped(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
 
@@ -72,7 +70,7 @@ class RigListCommand:
     """
 
     def run(self) -> None:
-        """Print them."""
+        """Print the list."""
         from estimator.rigs.rig import SHIPPED_RIGS
 
         width = max(map(len, SHIPPED_RIGS))

@@ -1,11 +1,11 @@
-"""Rig files from a record, or from answers."""
+"""Rig files from a record or from answers to questions: sampling step, units, limits and prior intervals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from estimator.identification.data.record_files import read_record_file
 from estimator.identification.data.text_tables import read_table
@@ -16,25 +16,28 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.units import conversion_factor, to_si_unit
 from estimator.support.argument_checks import mask_control_codes
 
+Answer = TypeVar("Answer")
+
+#: Answer that leaves a value out.
 _NOT_KNOWN = "not known"
 
 
 def rig_text_from_record(
     path: Path, step: float | None = None, input_column: str | None = None, output_column: str | None = None
 ) -> tuple[str, str]:
-    """The file for a record, and what was taken from where: the step, and units that are not the columns'.
+    """The rig file for a record, and sentences about the source of its step and units.
 
-    The step is that of its column of times; units and kind are those of the names of its columns, but as SI has them
-    without a prefix, so that results are in kg and N/m also where a column is in mm. A MAT file tells none of these.
+    The step is of the column of times; units and kind are of the names of the columns, but in SI units without prefix,
+    so that results are in kg and N/m also where a column is in mm. A MAT file has none of these.
 
     Args:
         path: of a CSV or MAT file.
-        step: sampling step [s]; None: that of the times.
-        input_column: name of the input's column or variable; None: one of the usual.
-        output_column: of the output's, likewise.
+        step: sampling step [s]; None: by the times.
+        input_column: name of the input's column or variable; None: one of the usual names.
+        output_column: name of the output's, likewise.
 
     Raises:
-        ValueError: where neither the caller nor the file gives the step, or the file is not as it must be.
+        ValueError: where neither the caller nor the file gives the step, or the file is malformed.
         FileNotFoundError: if there is no such file.
     """
     if not path.exists():
@@ -42,10 +45,10 @@ def rig_text_from_record(
             f"from must be a CSV or MAT file, or the name of a rig that ships, but there is no {path}"
         )
     if not path.is_file():
-        raise ValueError(f"from must be a CSV or MAT file, but is {path}; leave --from away, and answer the questions")
+        raise ValueError(f"from must be a CSV or MAT file, but is {path}; leave --from out, and answer the questions")
     if path.suffix.lower() == ".mat":
         if step is None:
-            raise ValueError(f"{path} must be a CSV file to tell the step, but is a MAT file; add --step SECONDS")
+            raise ValueError(f"{path} must be a CSV file to have a step, but is a MAT file; add --step SECONDS")
         rig = Rig(step, input=Channel(column=input_column), output=Channel(column=output_column))
         read_record_file(path, rig)
         return rig.to_toml(f", from {mask_control_codes(path.name)}"), _sampling_step_sentence(step, "--step")
@@ -58,23 +61,21 @@ def rig_text_from_record(
         )
     if step is not None and step_of_times is not None and abs(step_of_times / step - 1) > 0.01:
         raise ValueError(
-            f"{path}: times are {step_of_times:.6g} s apart, but the step is {step:.6g} s; mend one of them"
+            f"{path}: times are {step_of_times:.6g} s apart, but the step is {step:.6g} s; correct one of them"
         )
     step_source = "--step"
     if step is None:
-        # Times are written with some digits, and their mean difference is off by the last of them.
+        # Times are rounded, so that the last digits of their mean difference are wrong.
         step = float(f"{step_of_times:.6g}")
         step_source = f"the times in {table.names[table.time_column or 0]:.60}" if table.names else "the first column"
     sentences = [_sampling_step_sentence(step, step_source)]
-    input_unit, output_unit = (
-        None if place is None else table.unit(place) for place in (table.input_column, table.output_column)
-    )
-    # A name that says nothing was taken by its place, and stands in the file to be seen.
+    input_unit, output_unit = (None if place is None else table.unit(place) for place in (table.u, table.y))
+    # A column without a known name was chosen by its position; its name in the file lets the user check it.
     column_names = [
         None if place is None or table.has_known_name(place) else table.names[place]
         for place in (table.input_column, table.output_column)
     ]
-    # A g of an input may be one of weight.
+    # The unit g of an input may be a force.
     si_units = [
         one if one in (None, "g") and k == 0 else to_si_unit(one or "1")[1]
         for k, one in enumerate((input_unit, output_unit))
@@ -85,23 +86,23 @@ def rig_text_from_record(
     rig = Rig(step, input=Channel(si_units[0] or "1", column=input_column or column_names[0]), output=output)
     for name, one, base in zip(("input", "output"), (input_unit, output_unit), si_units, strict=True):
         if one and base and conversion_factor(one, base) != 1.0:
-            sentences.append(f"The {name} is in {one}, and is taken in {base}: results are in units of SI.")
+            sentences.append(f"The {name} is in {one}, and converted to {base}: results are in SI units.")
     note = "" if table.names else ", which names no column: units, kind and times in seconds are guessed"
     return rig.to_toml(f", from {mask_control_codes(path.name)}{note}"), "\n".join(sentences)
 
 
 def _sampling_step_sentence(step: float, source: str) -> str:
-    """The step that was taken, in words."""
+    """A sentence with the sampling step and its source."""
     return f"The sampling step is {step:.6g} s ({1 / step:.6g} Hz), by {source}."
 
 
 def ask_for_rig() -> Rig:
-    """A rig from answers to questions on the terminal.
+    """Ask for a rig on the terminal.
 
     Raises:
-        ValueError: where nobody answers.
+        ValueError: at the end of the input.
     """
-    print("An empty answer takes what stands in parentheses; Ctrl-C ends it.")
+    print("An empty answer takes the value in parentheses; Ctrl-C ends it.")
     try:
         step = _ask_until_valid("Sampling step in seconds, or rate such as 1000 Hz", None, _parse_sampling_step)
         interpolation = _ask_until_valid(
@@ -129,7 +130,7 @@ def ask_for_rig() -> Rig:
             Channel(input_channel.unit, limit=limit),
             Channel(unit, kind=kind, range=output_range),
         )
-        print("What you believe of m, c, a and b: two numbers, which hold it with 90 %.")
+        print("Prior intervals of m, c, a and b: two numbers, between which it is with 90 %.")
         guess = {}
         for name in "mcab":
             interval = _ask_until_valid(
@@ -145,8 +146,8 @@ def ask_for_rig() -> Rig:
     return Rig.from_dict({**rig.to_dict(), "guess": guess})
 
 
-def _ask_until_valid(question: str, default: str | None, parse: Callable[[str], Any]) -> Any:
-    """Ask until the answer can be taken."""
+def _ask_until_valid(question: str, default: str | None, parse: Callable[[str], Answer]) -> Answer:
+    """Ask until the answer can be parsed."""
     shown = f"{question} ({default}): " if default is not None else f"{question}: "
     while True:
         answer = input(shown).strip() or default

@@ -1,22 +1,25 @@
-"""``duffing-env run``: an experiment on a rig, that ends with its parameters."""
+"""``duffing-env run``: run an experiment on a rig, and identify its parameters meanwhile."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from agents.hardware.run_settings import RunSettings
+
+if TYPE_CHECKING:
+    from agents.hardware.experiment_run import RunResult
 
 
 @dataclass(frozen=True)
 class RunCommand:
     """Run an experiment on a rig, and identify while it goes on.
 
-    The input is zero before and after, whatever happens. docs/running.md says what a plant is, and what can go wrong.
+    The input is zero before and after, whatever happens. docs/running.md describes plants, and what can go wrong.
 
     $ duffing-env run rig.toml --plant agents.hardware.simulated_plant:plant --out run
     $ duffing-env run rig.toml --plant agents.hardware.visa_instrument:plant --out run
@@ -28,18 +31,18 @@ class RunCommand:
     rig: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RIG")]
     """Rig file, with input.limit and output.range, and a guess where there is no posterior."""
     plant: Annotated[str, tyro.conf.arg(metavar="MODULE:FACTORY")]
-    """What makes the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
+    """Factory of the plant: factory(rig, **instrument), with the table [instrument] of the rig file."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
     """New folder for the samples and the manifest."""
     posterior: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[POSTERIOR]")] = None
-    """What is known before: a file of identify --save, or estimator.npz of a run. The rig's guess if there is none."""
+    """Belief before: a file of identify --save, or estimator.npz of a run; by the rig's guess if not given."""
     plan: Annotated[RunSettings, tyro.conf.arg(name="")] = field(default_factory=RunSettings)
-    """What to do."""
+    """Settings of the run."""
 
     def run(self) -> None:
-        """Run, and print the parameters; the exit status is 1 after a trip, or where the input could not be zeroed."""
+        """Run, and print the parameters; the exit status is `RunResult.exit_status`."""
         from agents.console_output import print_warning, print_wrapped
-        from agents.hardware.experiment_run import run_experiment
+        from agents.hardware.experiment_run import NOT_ZEROED, run_experiment
         from agents.hardware.plant_interface import load_plant
         from estimator import Rig
         from estimator.saving import load_estimator
@@ -56,7 +59,7 @@ class RunCommand:
             if hasattr(plant, "close"):
                 plant.close()
         print_run_result(result)
-        if result.outcome == "zero":
+        if result.outcome == NOT_ZEROED:
             print_wrapped(f"duffing-env: complete, but {result.message}", sys.stderr)
         elif result.exit_status:
             print_wrapped(f"duffing-env: ended early ({result.outcome}): {result.message}", sys.stderr)
@@ -65,8 +68,8 @@ class RunCommand:
         sys.exit(result.exit_status)
 
 
-def print_run_result(result: Any) -> None:
-    """Print the parameters with their intervals, and what was late."""
+def print_run_result(result: RunResult) -> None:
+    """Print the parameters with their intervals, and the number of late ticks."""
     from agents.console_output import format_table
     from agents.console_output import print_texts_and_tables as print_all
 

@@ -72,6 +72,6 @@ def test_a_run_meets_its_ticks(set_anew, tmp_path):
     found = run_experiment(
         RIG, SimulatedPlant(RIG, clock=clock), tmp_path / "run", RunSettings("prbs", 40), clock=clock
     )
-    assert (found.ended, found.exit_status, found.late) == ("complete", 0, 0)
+    assert (found.outcome, found.exit_status, found.late_ticks) == ("complete", 0, 0)
     due, seen = np.loadtxt(tmp_path / "run/samples.csv", delimiter=",", skiprows=1, usecols=(1, 7), unpack=True)
     np.testing.assert_allclose(seen, due, rtol=0, atol=1e-9)

@@ -72,7 +72,7 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     status, told, _ = run("rig", "init", "rig.toml", "--from", "record.csv")
     assert status == 0
     assert "The sampling step is 0.001 s (1000 Hz), by the times in time [ms]." in told
-    assert "The output is in mm, and is taken in m" in told
+    assert "The output is in mm, and converted to m" in told
     rig = Rig.from_file("rig.toml")
     assert (rig.step, rig.input.unit, rig.output.unit, rig.output.kind) == (1e-3, "N", "m", "displacement")
     status, told, _ = run("identify", "rig.toml", "record.csv", "--report", "out/page.html")
@@ -143,7 +143,7 @@ def test_warnings_are_told(run, folder, monkeypatch):
         (["rig", "init", "new.toml", "--from", "fortnights.csv"], "the unit of the times must be one of s, ms"),
         (
             ["rig", "init", "new.toml", "--from", "r.mat"],
-            "r.mat must be a CSV file to tell the step, but is a MAT file",
+            "r.mat must be a CSV file to have a step, but is a MAT file",
         ),
         (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
         (

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from agents.evaluation.comparison_tables import ComparisonSettings
 from agents.evaluation.html_report import write_html_report
 from agents.evaluation.policy_evaluation import evaluate_policies
 
@@ -19,7 +20,7 @@ VOID = {"meta", "br", "link", "img", "path", "use", "rect", "circle"}
 def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     evaluations = evaluate_policies(["uniform", "prbs"], systems=4, options={"horizon": 40, "max_output": 0.3})
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"note": "<b>&"}}
+    settings = ComparisonSettings("duffing_env/Amplitude-v0", 4, 0, {"note": "<b>&"})
     write_html_report(path, evaluations, settings, ["evaluate.py", "--options", '{"a": "<script>"}'])
     return path
 
@@ -62,7 +63,7 @@ def test_the_page_is_whole_and_asks_for_nothing(page):
 
 def test_the_page_is_the_same_for_the_same_evaluations(page, tmp_path):
     evaluations = evaluate_policies(["uniform"], systems=2, options={"horizon": 20})
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 2, "seed": 0, "options": {}}
+    settings = ComparisonSettings("duffing_env/Amplitude-v0", 2, 0, {})
     for name in ("a.html", "b.html"):
         write_html_report(tmp_path / name, evaluations, settings, ["evaluate.py"])
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
@@ -94,7 +95,7 @@ TITLES = ["$\\frac{$", "<script>alert(1)</script>", "\x1b[31mred", "=1+1", "\\te
 def test_no_name_is_taken_for_code(tmp_path):
     """Names of policies are whatever users write: no formula, element or control code comes of them."""
     (first, *_) = evaluate_policies(["uniform"], systems=4, options={"horizon": 8})
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {}}
+    settings = ComparisonSettings("duffing_env/Amplitude-v0", 4, 0, {})
     named = [replace(first, policy=title) for title in TITLES]
     write_html_report(tmp_path / "report.html", named, settings, ["evaluate.py"])
     parser = Balance()

@@ -16,7 +16,7 @@ from agents.commands import main
 from agents.commands.identify_command import print_identification as show_identified
 from agents.commands.rig_file_builder import rig_text_from_record
 from agents.console_output import format_table, print_texts_and_tables
-from agents.evaluation.comparison_tables import print_comparison_table
+from agents.evaluation.comparison_tables import ComparisonSettings, print_comparison_table
 from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
 from agents.evaluation.html_report import write_html_report
 from agents.evaluation.policy_evaluation import evaluate_policies
@@ -69,7 +69,7 @@ def evaluation():
 
 def test_policies_in_pages_and_figures(evaluation, tmp_path):
     named = [replace(evaluation, policy=name) for name in SHARP]
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 4, "seed": 0, "options": {"own": SHARP}}
+    settings = ComparisonSettings("duffing_env/Amplitude-v0", 4, 0, {"own": SHARP})
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of layouts that have no room
         write_html_report(tmp_path / "report.html", named, settings, ["evaluate.py", *SHARP])

@@ -1,7 +1,7 @@
 """The leaderboard: intervals, table, JSON and figures, from evaluations whose figures are known."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from unittest.mock import ANY
 
 import matplotlib.image
@@ -13,6 +13,7 @@ import agents.evaluation.figures
 import agents.evaluation.policy_evaluation
 from agents.evaluation.comparison import compare_policies
 from agents.evaluation.comparison_tables import (
+    ComparisonSettings,
     comparison_table,
     policy_by_estimator_table,
     print_comparison_table,
@@ -220,7 +221,7 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
     ]
     print_estimator_table(evaluations)
     printed = capsys.readouterr().out
-    assert "what other estimators make of the same inputs and outputs" in printed
+    assert "other estimators on the same inputs and outputs" in printed
     heads, rows = policy_by_estimator_table(evaluations)
     assert heads[2:] == [METRIC_COLUMNS[name].title for name in names]
     assert all(cell in printed for row in rows for cell in row)
@@ -308,11 +309,11 @@ def load_strictly(path):
 
 def test_json_is_valid_and_complete(tmp_path):
     evaluations = [make_evaluation("one"), make_evaluation("two", seed=1)]
-    settings = {"env": "duffing_env/Amplitude-v0", "systems": 30, "seed": 0, "options": {"horizon": 20}}
+    settings = ComparisonSettings("duffing_env/Amplitude-v0", 30, 0, {"horizon": 20})
     write_evaluations(tmp_path / "made" / "evaluation.json", evaluations, settings)
     written = load_strictly(tmp_path / "made" / "evaluation.json")
     assert set(written) == {"settings", "policies"}
-    assert written["settings"] == settings
+    assert written["settings"] == asdict(settings)
     assert list(written["policies"]) == ["one", "two"]
     for evaluation in evaluations:
         assert written["policies"][evaluation.policy] == {**summarise_metrics(evaluation), "estimators": {}}
@@ -320,7 +321,7 @@ def test_json_is_valid_and_complete(tmp_path):
 
 def test_json_stays_valid_where_a_figure_is_infinite(tmp_path):
     evaluation = make_evaluation(log_posterior_gain=np.zeros(3), arrow_rmse=np.array([1.0, np.inf, np.inf]))
-    write_evaluations(tmp_path / "evaluation.json", [evaluation], {})
+    write_evaluations(tmp_path / "evaluation.json", [evaluation], ComparisonSettings("Short-v0", 2, 0, {}))
     entry = load_strictly(tmp_path / "evaluation.json")["policies"]["policy"]["arrow_rmse"]
     assert entry == {"median": None, "low": 1.0, "high": None}
 
