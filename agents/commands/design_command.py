@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from agents.hardware.next_experiment import ExperimentDesign
+    from agents.hardware.experiment_design import ExperimentDesign
 
 
 @dataclass(frozen=True)

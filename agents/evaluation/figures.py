@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from agents.evaluation.policy_rollout import Evaluation
-    from agents.hardware.next_experiment import ExperimentDesign
+    from agents.hardware.experiment_design import ExperimentDesign
     from agents.training.checkpoints import LearningPoint
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#000000")
