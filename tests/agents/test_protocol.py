@@ -212,7 +212,7 @@ def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_p
     before = (tmp_path / "broken.jsonl").read_bytes()
     for path, message in {
         "broken.jsonl": "board must hold an entry a line, but broken.jsonl:2 is not one",
-        "broken.jsonl/mine.jsonl": "folder of board must be a folder, but broken.jsonl is a file; name another place",
+        "broken.jsonl/mine.jsonl": "folder of board must be a folder, but broken.jsonl is a file; name another folder",
         str(tmp_path): "board must be a file, but is the folder",
     }.items():
         status, _, messages = command(*words, path)

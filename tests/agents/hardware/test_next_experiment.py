@@ -249,8 +249,8 @@ def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
     def played(name, samples, **more):
         clock = JumpingClock()
         plant = SimulatedPlant(RIG, TRUTH, seed=samples, clock=clock)
-        return run_experiment(RIG, plant, tmp_path / name, RunSettings(policy="prbs", samples=samples, **more.pop("plan", {})),
-                   clock=clock, **more)  # fmt: skip
+        settings = RunSettings(policy="prbs", samples=samples, **more.pop("plan", {}))
+        return run_experiment(RIG, plant, tmp_path / name, settings, clock=clock, **more)
 
     first = played("first", 200)
     known = load_estimator(first.folder / "estimator.npz").belief
