@@ -81,7 +81,7 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, example, t
     [
         (["--total-timesteps", "1000"], "total_timesteps must be at least a roll-out, 2048, but are 1000; take more"),
         (["--env-id", "Short-v7"], "Short"),
-        (["--output", "taken"], "output must be a folder, but taken is a file; name another place"),
+        (["--output", "taken"], "output must be a folder, but taken is a file; name another folder"),
         (["--output", "run"], "output must be a folder for a policy, but run holds a run; remove it or name another"),
     ],
 )

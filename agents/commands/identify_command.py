@@ -144,4 +144,4 @@ def print_identification(result: Result) -> None:
     for warning in result.warnings:
         rich_console().print(Text.assemble((warning.name, "bold red"), f": {mask_control_codes(warning.message)}"))
     if not result.warnings:
-        rich_console().print("No check contradicts this result.", style="green")
+        rich_console().print("No check speaks against this result.", style="green")

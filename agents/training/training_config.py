@@ -210,7 +210,7 @@ def claim_run_folder(config_file: Path, config: TrainConfig) -> None:
     for name, value in new_settings.items():
         if old_settings.get(name) != value:
             raise ValueError(
-                f"output must be a new folder or that of the same command, but in {config_file} {name} is "
+                f"output must be a new folder or the folder of the same command, but in {config_file} {name} is "
                 f"{short_repr(old_settings.get(name))} instead of {short_repr(value)}; name another folder"
             )
     if not config_file.exists() or old_content["config"] != described["config"]:
@@ -249,4 +249,6 @@ def read_config(folder: Path) -> TrainConfig:
         settings["hyperparameters"] = parse_hyperparameters(ALGORITHMS[settings["algo"]], settings["hyperparameters"])
         return TrainConfig(**settings)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{CONFIG_FILE} must be that of a run, but that of {folder} is not: {error!r}") from error
+        raise ValueError(
+            f"{CONFIG_FILE} of {folder} must hold the settings of a training run, but does not: {error!r}; train anew"
+        ) from error

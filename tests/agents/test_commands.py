@@ -81,7 +81,7 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     assert float(row[1]) == pytest.approx(0.4, rel=0.01)
     assert row[-1] == "kg"
     assert "The sampling step is 0.001 s (1000 Hz) by the rig, and the times agree." in told
-    assert "No check contradicts this result." in told
+    assert "No check speaks against this result." in told
     page = Path("out/page.html").read_text()
     assert "duffing-env identify rig.toml record.csv --report out/page.html" in page
     lines = Path("record.csv").read_text().splitlines()

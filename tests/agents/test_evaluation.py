@@ -553,7 +553,7 @@ def test_senseless_arguments_are_refused():
 
 def test_a_file_in_place_of_the_folder_is_found_before_the_work(tmp_path):
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(NotADirectoryError, match=r"output must be a folder, but .*file is a file; name another place"):
+    with pytest.raises(NotADirectoryError, match=r"output must be a folder, but .*file is a file; name another folder"):
         compare_policies(["prbs"], "duffing_env/Short-v0", 2, {}, tmp_path / "file" / "below")
     assert (tmp_path / "file").read_text() == "kept"
 

@@ -75,7 +75,7 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
     assert "3 complete trials, 0 pruned" in printed
     rows = [line.split()[0] for line in printed.splitlines() if re.match(r"\d+ +\d", line)][-3:]
     assert [int(row) for row in rows] == sorted(found, key=lambda number: -found[number])
-    with pytest.raises(ValueError, match="output must be a new folder or that of the same command"):
+    with pytest.raises(ValueError, match="output must be a new folder or the folder of the same command"):
         tune_hyperparameters(tiny(folder, seed=1), 4)
 
 

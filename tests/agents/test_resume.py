@@ -272,7 +272,9 @@ def test_a_finished_run_is_not_resumed(tmp_path):
 def test_a_configuration_of_something_else_is_refused(tmp_path):
     for content in ("{", "[]", '{"config": {"env": 3}}'):
         (tmp_path / "config.json").write_text(content)
-        with pytest.raises(ValueError, match=r"config.json must be that of a run, but that of .* is not"):
+        with pytest.raises(
+            ValueError, match=r"config.json of .* must hold the settings of a training run, but does not"
+        ):
             resume(tmp_path)
 
 

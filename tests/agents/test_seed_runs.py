@@ -49,7 +49,7 @@ def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     assert len(list(train_seeds(config(tmp_path), 2))) == 2
     assert (tmp_path / "0" / "policy.json").stat().st_mtime_ns == before
     assert [run.seed for run in carried] == [0, 0, 1]
-    message = r"that of the same command, but in .*0/config.json reward is 'information_gain' instead of 'fisher'"
+    message = r"the folder of the same command, but in .*0/config.json reward is 'information_gain' instead of 'fisher'"
     with pytest.raises(ValueError, match=message):
         list(train_seeds(replace(config(tmp_path), reward="fisher"), 2))
     other = replace(config(tmp_path), hyperparameters=replace(TINY, gamma=0.5))
