@@ -138,7 +138,7 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
 @table(
     ("words", "message"),
     [
-        (["design", "rig.toml", "-o", "rig.toml"], "output must be a file of its own, but is rig.toml, and it is read"),
+        (["design", "rig.toml", "-o", "rig.toml"], "output must be a separate file, but is rig.toml, and it is read"),
         (
             ["design", "rig.toml", "-o", "a.png", "--figure", "./a.png"],
             "figure must be .* and so is output; name another",
