@@ -92,7 +92,7 @@ class DuffingVecEnv(BatchVecEnv):
             ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
         num_envs: number of rows; that of ``env`` where it was made.
         seed: of the batch; the next reset uses it.
-        levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by its index; 0: any input between.
+        levels: number of evenly spaced inputs from -1 to 1, of which an action is the index; 0: any input between.
         options: of the environment, and ``threads``.
 
     Raises:

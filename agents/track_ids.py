@@ -21,7 +21,7 @@ def options_with_rig(options: dict[str, Any], rig: str | None) -> dict[str, Any]
         return options
     from estimator.rigs.rig import Rig
 
-    return {**options, "rig": Rig.of(rig).to_dict()}
+    return {**options, "rig": Rig.from_any(rig).to_dict()}
 
 
 def full_track_id(env_id: Any) -> Any:

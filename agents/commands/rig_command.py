@@ -37,7 +37,7 @@ class RigInitCommand:
 
     def run(self) -> None:
         """Write the file."""
-        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record, to_toml
+        from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record
         from agents.console_output import print_wrapped
         from agents.output_paths import check_not_overwritten
         from estimator.rigs.rig import SHIPPED_RIGS

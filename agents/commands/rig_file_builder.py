@@ -69,7 +69,9 @@ def rig_text_from_record(
         step = float(f"{step_of_times:.6g}")
         step_source = f"the times in {table.names[table.time_column or 0]:.60}" if table.names else "the first column"
     sentences = [_sampling_step_sentence(step, step_source)]
-    input_unit, output_unit = (None if place is None else table.unit(place) for place in (table.u, table.y))
+    input_unit, output_unit = (
+        None if place is None else table.unit(place) for place in (table.input_column, table.output_column)
+    )
     # A column without a known name was chosen by its position; its name in the file lets the user check it.
     column_names = [
         None if place is None or table.has_known_name(place) else table.names[place]

@@ -12,8 +12,9 @@ from estimator.belief import Belief
 from estimator.inference.batch_posteriors import posteriors
 from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.models.difference_equation import difference
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.rig import Rig
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 
 #: Name of the offline maximum a posteriori fit.
 AUDITOR = "auditor"

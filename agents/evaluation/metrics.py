@@ -15,9 +15,10 @@ from estimator.inference.fisher_information import fisher_information
 from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import coefficients_of, to_physical
 from estimator.rigs.units import Scales
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 
 #: Metric of coverage to the nominal level of its credible intervals.
 CREDIBLE_LEVELS = {"coverage_50": 0.50, "coverage": 0.90, "coverage_95": 0.95}

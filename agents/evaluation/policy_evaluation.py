@@ -21,10 +21,6 @@ from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.plants.silverbox_record import record_available
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
-from estimator.models.named_parameters import Parameters
-from estimator.rigs.physical_parameters import coefficients_of
-from estimator.rigs.units import Scales
-from estimator.support.argument_checks import MAX_SEED, check_integer, mask_control_codes
 from estimator.support.argument_checks import MAX_SEED, check_integer
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress

@@ -21,10 +21,11 @@ from duffing_env.experiment_config import Experiment
 from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
+from estimator.models.named_parameters import Parameters
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import mask_control_codes
-from estimator.support.array_types import FloatArray, Parameters
+from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress
 
 #: A policy by its name, its folder or its class, or a policy object (`agents.policies.make_policy`).

@@ -131,7 +131,7 @@ def run_experiment(
         >>> bool(abs(mean - 0.42) < 4 * std < 0.04)
         True
     """
-    run = _prepare_run(Rig.of(rig), check_plant(plant), settings or RunSettings(), prior, clock or RealClock())
+    run = _prepare_run(Rig.from_any(rig), check_plant(plant), settings or RunSettings(), prior, clock or RealClock())
     recording = Recording(out, _manifest(run), run.rig)
     session = Session(run.plant, run.rig, recording.log_event, run.watchdog_timeout, run.settings.stale)
     ending = _play(run, session, recording, on_progress or (lambda samples: None))

@@ -26,7 +26,7 @@ from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
 from estimator.belief import Belief, covariance_indices
-from estimator.identification.diagnostics.validity_checks import (
+from estimator.identification.diagnostics.record_checks import (
     MIN_SAMPLES_PER_PERIOD,
     RECOMMENDED_SAMPLES_PER_PERIOD,
 )

@@ -180,7 +180,8 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
 
 def _loop_over_points(model: Model, before: str, body: str) -> str:
     """Source of ``update(W)`` with a loop over all sigma points."""
-    head = f"@scalar_jit\ndef update(W):\n    cubature_columns(W)\n{before}    for P in range({2 * len(model.dynamic_names)}):\n"
+    n_points = 2 * len(model.dynamic_names)
+    head = f"@scalar_jit\ndef update(W):\n    cubature_columns(W)\n{before}    for P in range({n_points}):\n"
     return head + body + "    finish(W)\n"
 
 

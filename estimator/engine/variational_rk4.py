@@ -37,7 +37,7 @@ _STAGE_WEIGHTS = {"A": (sp.Rational(1, 6), sp.S.Half), "B": (sp.Rational(1, 3), 
 
 #: Runge-Kutta steps of the state over a sample that is only imagined: the first number where the model takes as many or
 #: more, else the second. What is linear takes one step, whose stages are begin, middle and end of the sample. Two steps
-#: are wrong by more than the noise where a period has five samples (tests/agents/test_belief_rollout.py), and peaks then
+#: are wrong by more than the noise at five samples per period (tests/agents/test_belief_rollout.py), and peaks then
 #: lie beyond where they are planned.
 _COARSE_STEPS, _MIN_COARSE_STEPS = 4, 2
 

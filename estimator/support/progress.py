@@ -13,7 +13,7 @@ from estimator.support.argument_checks import mask_control_codes
 
 Task = TypeVar("Task")
 
-#: Seconds until the first line where stderr is no terminal, and at least between two.
+#: Shortest time to the first line and between lines, where stderr is no terminal [s].
 REPORT_INTERVAL = 5.0
 
 #: Longest line [characters].
@@ -107,7 +107,7 @@ def _terminal_bar() -> Iterator[Callable[[float, str], None]]:
     columns = BarColumn(12), TextColumn("{task.description}", markup=False)
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda share, said: bar.update(task, completed=share, description=said[: console.width - 14])
+        yield lambda share, line: bar.update(task, completed=share, description=line[: console.width - 14])
 
 
 def iterate_with_progress(tasks: Iterable[tuple[str, Task]]) -> Iterator[Task]:

@@ -1,6 +1,6 @@
 """The options of a belief update and their ranges."""
 
-#: Factorisation of the posterior to its default number of iterations per sample: the structured one iterates scalars only.
+#: Factorisation of the posterior to its default number of iterations per sample; the structured one iterates scalars.
 DEFAULT_ITERATIONS = {"structured": 3, "mean_field": 10}
 
 #: Upper limit of the iterations per sample [1].
