@@ -92,7 +92,7 @@ class DuffingVecEnv(BatchVecEnv):
             ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
         num_envs: number of rows; that of ``env`` where it was made.
         seed: of the batch; the next reset uses it.
-        levels: number of evenly spaced inputs from -1 to 1, of which an action is the index; 0: any input between.
+        levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by index; 0: any input between.
         options: of the environment, and ``threads``.
 
     Raises:
@@ -169,14 +169,14 @@ class DuffingVecEnv(BatchVecEnv):
 
     @property
     def episode_state(self) -> dict[str, npt.NDArray[Any]]:
-        """As `DuffingVectorEnv.episode_state`."""
+        """As `DuffingVectorEnv.memory`."""
         return self._batch.memory | {"returns": self._returns, "lengths": self._lengths}
 
-    def restore_episode_state(self, memory: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
-        """Go on with the episodes that a copy of `memory` is of, and see what was seen then."""
+    def restore_episode_state(self, state: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
+        """Go on with the episodes that which a copy of `episode_state` was made of, and return their observations."""
         observations = self.reset()
         for name, array in self.episode_state.items():
-            array[...] = memory[name]
+            array[...] = state[name]
         return observations
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
