@@ -173,7 +173,7 @@ class DuffingVecEnv(BatchVecEnv):
         return self._batch.memory | {"returns": self._returns, "lengths": self._lengths}
 
     def restore_episode_state(self, state: dict[str, npt.NDArray[Any]]) -> VecEnvObs:
-        """Go on with the episodes that which a copy of `episode_state` was made of, and return their observations."""
+        """Go on with the episodes of a copy of `episode_state`, and return their observations."""
         observations = self.reset()
         for name, array in self.episode_state.items():
             array[...] = state[name]

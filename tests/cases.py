@@ -335,7 +335,7 @@ def base(rng, kind="acc", truth=LIGHT):
     x, v = moved((1.0, c / m, a / m, b / m), -force(grid(t, 3)), t)
     y = -(c * v + a * x + b * x**3) / m
     names = ("time [s]", f"input base {kind} [m/s2]", f"{kind} mass [m/s2]")
-    init = {"source": f"input base {kind}", "sink": f"{kind} mass"}
+    init = {"input_column": f"input base {kind}", "output_column": f"{kind} mass"}
     return Made({"r.csv": text(names, t, force(t), noisy(rng, y)).encode()}, (np.nan, *(p / m for p in truth[1:])),
                 init, "linear")  # fmt: skip
 
@@ -406,7 +406,7 @@ def scope(rng, step=1e-3, truth=LIGHT):
     """Lines of metadata before the names."""
     t, u, y = driven(rng, truth, 3000, step)
     head = f"Model,SCOPE\nFirmware Version,1.2\nHorizontal Units,s\nSample Interval,{step}\nRecord Length,3000\n\n"
-    init = {"source": "CH1", "sink": "CH2"}
+    init = {"input_column": "CH1", "output_column": "CH2"}
     return Made({"r.csv": (head + text(("TIME", "CH1", "CH2"), t, u, y)).encode()}, truth, init)
 
 
@@ -416,7 +416,7 @@ def lvm(rng, truth=LIGHT):
     head = "LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\n***End_of_Header***\t\n"
     head += "Channels\t2\t\nSamples\t3000\t3000\t\n***End_of_Header***\t\n"
     body = text(("X_Value", "Force", "Laser"), t, u, y, separator="\t").replace("\n", "\tComment\n", 1)
-    return Made({"r.csv": (head + body).encode()}, truth, {"source": "Force", "sink": "Laser"})
+    return Made({"r.csv": (head + body).encode()}, truth, {"input_column": "Force", "output_column": "Laser"})
 
 
 def sep(rng, encoding="utf-8", truth=LIGHT):
@@ -439,7 +439,11 @@ def over_range(rng, step=1e-3, truth=LIGHT):
     rows = [f"{1e3 * s:.6f},{a:.9g},{'∞' if b > stop else '-∞' if b < -stop else f'{1e3 * b:.9f}'}"
             for s, a, b in zip(t, u, y, strict=True)]  # fmt: skip
     head = ["Time,Channel A,Channel B", "(ms),(V),(mV)", ""]
-    return Made({"r.csv": "\n".join([*head, *rows, ""]).encode()}, truth, {"source": "Channel A", "sink": "Channel B"})
+    return Made(
+        {"r.csv": "\n".join([*head, *rows, ""]).encode()},
+        truth,
+        {"input_column": "Channel A", "output_column": "Channel B"},
+    )
 
 
 KINDS: dict[str, Callable[..., Made]] = {

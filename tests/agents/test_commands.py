@@ -192,7 +192,7 @@ def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step,
     assert "Next: duffing-env identify rig.toml r.csv" in told
     rig = Rig.from_file("rig.toml")
     assert rig == Rig(rig.step, input={"unit": units[0]}, output={"unit": units[1], "kind": kind})
-    assert ("just before the input goes" in Path("rig.toml").read_text()) == (kind == "acceleration")
+    assert ("just before the input changes" in Path("rig.toml").read_text()) == (kind == "acceleration")
     assert rig.step == pytest.approx(step, rel=1e-6)
 
 

@@ -107,7 +107,7 @@ def test_free_runs_of_many_systems_are_those_of_each():
 
 @table(("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((1,), (), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))])
 def test_a_free_run_names_the_shapes_that_do_not_fit(c, u, state):
-    with pytest.raises(ValueError, match="or one more axis, of systems, but have"):
+    with pytest.raises(ValueError, match="or one more axis for systems, but have"):
         free_run(Model(**TANK), np.ones(c), np.ones(u), np.ones(state))
 
 
