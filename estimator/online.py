@@ -345,6 +345,6 @@ def _checked_prior(model: Model, prior: Belief | None, settings: EstimatorSettin
         prior = silverbox_prior(model) if model == difference() else recorded_prior(model)
     if not isinstance(prior, Belief) or prior.model != model:
         raise ValueError(
-            f"prior must be a Belief of {model.name}, {tuple(model.coefficients)}, but is {prior!r:.60}; see estimator.priors"
+            f"prior must be a Belief of {model.name} {tuple(model.coefficients)}, but is {prior!r:.50}; see weak_prior"
         )
     return prior.with_factorisation(settings.factorisation)
