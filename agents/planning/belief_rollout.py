@@ -69,34 +69,34 @@ class BeliefRollout(NamedTuple):
 
 
 def _stage_cost(
-    INPUT, SHOWN, SPREAD, SURPRISE, COST, sensor_variance, accumulated_noise, limit, margin, hard_margin, input_weight,
-    goal, goal_weight, amplitude, recoverable_step,
+    INPUT, Y_PRED, S_PRED, PENDING_VARIANCE, COST, sensor_variance, accumulated_noise, limit, margin, hard_margin,
+    input_weight, goal, goal_weight, amplitude, recoverable_step,
 ):  # fmt: skip
     """The cost after a sample, the margin, and the standard deviations by which the output is within it.
 
     One function, as it is one loop over the lanes: four loops make decisions slower by some percent.
     """
-    deviation = np.sqrt(SPREAD + max(SURPRISE, accumulated_noise))
+    deviation = np.sqrt(S_PRED + max(PENDING_VARIANCE, accumulated_noise))
     # Harder braking than planned, where the input has room for it, makes up for the information of the output before.
     recoverable = abs(recoverable_step) * amplitude + (
-        recoverable_step * INPUT if SHOWN > 0.0 else -recoverable_step * INPUT
+        recoverable_step * INPUT if Y_PRED > 0.0 else -recoverable_step * INPUT
     )
-    margin_width = min(max(margin * np.sqrt(SPREAD), margin * deviation - recoverable), MAX_MARGIN_FRACTION * limit)
-    excess = (1.0 - hard_margin) * (abs(SHOWN) + margin_width - limit) / deviation
-    over = abs(SHOWN) + hard_margin * margin_width - limit
+    margin_width = min(max(margin * np.sqrt(S_PRED), margin * deviation - recoverable), MAX_MARGIN_FRACTION * limit)
+    excess = (1.0 - hard_margin) * (abs(Y_PRED) + margin_width - limit) / deviation
+    over = abs(Y_PRED) + hard_margin * margin_width - limit
     over, square = (over if over > 0.0 else 0.0), (excess * excess if excess > 0.0 else 0.0)
     limit_cost = COST + _VIOLATION_COST / limit * over + MARGIN_COST * square * square
-    goal_error = SHOWN - goal
+    goal_error = Y_PRED - goal
     return (
-        limit_cost + input_weight * INPUT * INPUT + goal_weight * (goal_error * goal_error + SPREAD - sensor_variance),
+        limit_cost + input_weight * INPUT * INPUT + goal_weight * (goal_error * goal_error + S_PRED - sensor_variance),
         margin_width,
         excess,
     )
 
 
-def _net_information(KNOWN, COST):
+def _net_information(INFORMATION, COST):
     """The information after a plan, less its cost; also of a plan whose numbers are no longer finite."""
-    score = KNOWN - COST
+    score = INFORMATION - COST
     return score if score > DIVERGED_SCORE else DIVERGED_SCORE
 
 
@@ -113,7 +113,7 @@ def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> Belie
     inputs = tuple(place[name] * LANES for name in ("INPUT", "LAST_INPUT", "OLDER_INPUT") if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
     started_row, margin_row, excess_row, variance_row = (
-        place[name] * LANES for name in ("BEGUN", "MARGIN", "NEAR", "SPREAD")
+        place[name] * LANES for name in ("HAS_PENDING", "MARGIN", "NEAR", "S_PRED")
     )
     first = next(iter(model.coefficients))
     covariance = place[f"P_{first}_{first}"] * LANES

@@ -121,7 +121,7 @@ def _compile_local_dynamics(model: Model) -> Any:
     n, k, size, u = model.n_states, model.n_coefficients, len(at), at["INPUT"]
     now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
     state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
-    linear, first = at[f"A_{state}_{state}"], at[f"E_{coefficient}"]
+    linear, first = at[f"A_{state}_{state}"], at[f"REGRESSOR_{coefficient}"]
 
     @kernel(variant=f"{model.name}_{model.digest}")
     def local_dynamics_kernel(means, states, inputs, found):

@@ -70,7 +70,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
         free_response.step,
     )
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
-    u, shown, velocity = at["INPUT"], at["SHOWN"], at["VELOCITY"]
+    u, shown, velocity = at["INPUT"], at["Y_PRED"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
     # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)

@@ -119,7 +119,7 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
         else:
             lines.append(("SHOWN", value))
             results |= {f"Y_{y}": "SHOWN"}
-    substep_arguments = ("T", "length", "root", "root_3") if model.is_continuous else ()
+    substep_arguments = ("TAU", "length", "root", "root_3") if model.is_continuous else ()
     return source + loop("step_plant", "The plant moves.", lines, results, *substep_arguments)
 
 

@@ -26,7 +26,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     from estimator.engine.symbolic import symbol
 
     # γ is the precision of one sample's process noise in the first sensor; the model's noise has unit strength.
-    noises = {"Q": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
+    noises = {"PROCESS_VARIANCE": symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")}
     noises |= {f"R_{y}": symbol(f"XI_RATE_{y}") / symbol(f"XI_SHAPE_{y}") for y in spec.belief_model.outputs}
     return expected_sample_source("expect_sample", spec, loop, noises)
 
@@ -65,7 +65,7 @@ def expected_sample_source(
             {row: f"V_{row}" for row in carried},
         )
         step = symbolic.substitute(variational_rk4.variational_rk4_step(model, spec.degree), substitutions)
-        source += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_E" for row in carried}, "T")
+        source += loop(f"{name}_move", "One Runge-Kutta step.", step, {row: f"{row}_END" for row in carried}, "TAU")
         steps = model.substeps
         body = f"    {name}_begin(W)\n    for s in range({steps}):\n        {name}_move(W, s / {steps})\n"
     update_lines, results = gaussian_update.update_without_data(model, motion, spec.degree)

@@ -23,7 +23,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     model = spec.belief_model
     truth_rows = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
     truth_rows |= {name: f"I_{name}" for name in belief_rows(model) if name.startswith("P_")}
-    names, stds = ["Q", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
+    names, stds = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
     noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
     return expected_sample_source("update_ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
 

@@ -56,7 +56,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     model = spec.belief_model
     believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
     true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
-    substep_arguments = ("T",) if model.is_continuous else ()
+    substep_arguments = ("TAU",) if model.is_continuous else ()
     source_text = loop(
         "step_believed", "The believed plant moves.", *propagate_state(model, spec.degree, believed), *substep_arguments
     )

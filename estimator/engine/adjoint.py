@@ -76,11 +76,11 @@ def _source(model: Model, degree: int) -> str:
 
     coefficients, integrated = list(model.coefficients), integrator_rows(model)
     path_rows, inputs = filter_state_rows(model), input_rows(model, degree)
-    information = [row for row in likelihood_rows(model) if row.startswith("F_")]
-    noises = ["Q", *(f"R_{y}" for y in model.outputs)]
-    shown = f"SHOWN_{next(iter(model.outputs))}"
+    information = [row for row in likelihood_rows(model) if row.startswith("INFORMATION_")]
+    noises = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)]
+    shown = f"Y_PRED_{next(iter(model.outputs))}"
     before, propagation = symbolic.propagate_sample(model)
-    always_counted = {symbolic.symbol("LIVE"): symbolic.sp.S.One}
+    always_counted = {symbolic.symbol("IS_COUNTED"): symbolic.sp.S.One}
     more, results = linearised_filter_step(model, propagation, degree, follows_outputs=False)
     lines = [(name, e.xreplace(always_counted)) for name, e in [*before, *more]]
     path_after = [results.get(row, row) for row in path_rows]
@@ -90,16 +90,16 @@ def _source(model: Model, degree: int) -> str:
         **({"M": integrated} if integrated else {}),
     }
     tuple_contents |= {"C": coefficients, "U": inputs, "N": noises}
-    after = [path_after, [results.get(row, row) for row in information], [results[shown], results["SPREAD"]]]
+    after = [path_after, [results.get(row, row) for row in information], [results[shown], results["S_PRED"]]]
     source = printer_numba.print_scalar_function(
         "finish", lines, after, tuple_contents, doc="Predict, and add the information."
     )
     outputs_kept = {row: results[row] for row in (*path_rows, *information, shown) if row in results}
-    adjoints = {"G": [f"G_{row}" for row in path_rows], "H": [f"G_{row}" for row in information]}
+    adjoints = {"G": [f"ADJ_{row}" for row in path_rows], "H": [f"ADJ_{row}" for row in information]}
     tuple_contents = {
         **{name: names for name, names in tuple_contents.items() if name != "F"},
         **adjoints,
-        "S": [f"G_{shown}"],
+        "S": [f"ADJ_{shown}"],
     }
     groups = [path_rows, integrated, inputs] if integrated else [path_rows, inputs]
     source += _reverse_source("finish_back", lines, outputs_kept, groups, tuple_contents)
@@ -114,27 +114,27 @@ def _integrator_source(model: Model, degree: int, integrated: list[str], path_ro
 
     tuple_contents = {"M": integrated, "C": list(model.coefficients), "U": input_rows(model, degree)}
     start = [printer_numba.print_expression(value) for value in symbolic.integrator_start(model).values()]
-    step, moves = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_E" for name in integrated}
+    step, moves = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_END" for name in integrated}
     source = printer_numba.print_scalar_function(
         "start", [], [start], {"P": path_rows}, doc="The integrator at the start of a sample."
     )
     source += printer_numba.print_scalar_function(
-        "move", step, [list(moves.values())], tuple_contents, ("T",), "A Runge-Kutta step."
+        "move", step, [list(moves.values())], tuple_contents, ("TAU",), "A Runge-Kutta step."
     )
-    adjoints = {"GM": [f"G_{name}" for name in integrated], "GU": [f"G_{name}" for name in tuple_contents["U"]]}
+    adjoints = {"GM": [f"ADJ_{name}" for name in integrated], "GU": [f"ADJ_{name}" for name in tuple_contents["U"]]}
     source += _reverse_source(
         "move_back",
         step,
         moves,
         [integrated, tuple_contents["U"]],
         {**tuple_contents, **adjoints},
-        ("T",),
+        ("TAU",),
         tuple_contents["U"],
     )
     # The integrator begins at the filter's states, with constant slopes and noise.
     states = list(model.states)
-    results = [f"G_M_{i}" for i in states] + [f"G_{row}" for row in path_rows[len(states) :]]
-    arguments = {"G": [f"G_{row}" for row in path_rows], "GM": adjoints["GM"]}
+    results = [f"ADJ_M_{i}" for i in states] + [f"ADJ_{row}" for row in path_rows[len(states) :]]
+    arguments = {"G": [f"ADJ_{row}" for row in path_rows], "GM": adjoints["GM"]}
     return source + printer_numba.print_scalar_function("start_back", [], [results], arguments, doc="Reverse of start.")
 
 
@@ -151,7 +151,7 @@ def _reverse_source(
     from estimator.engine import printer_numba
 
     back, found = with_reverse(lines, results, [row for group in result_groups for row in group], accumulated)
-    outcome = [[found[f"G_{row}"] for row in group] for group in result_groups]
+    outcome = [[found[f"ADJ_{row}"] for row in group] for group in result_groups]
     return printer_numba.print_scalar_function(name, back, outcome, tuple_contents, uniform, "The reverse derivative.")
 
 
@@ -177,16 +177,16 @@ def with_reverse(
     seeds: dict[str, str] = {}
     for row, value in results.items():
         if value in assigned and value not in seeds:
-            seeds[value] = f"G_{row}"
+            seeds[value] = f"ADJ_{row}"
         else:
             copied = symbolic.sp.Float(float(value)) if printer_numba.is_numeral(value) else symbolic.symbol(value)
             forward.append((f"{row}_copy", copied))
-            seeds[f"{row}_copy"] = f"G_{row}"
+            seeds[f"{row}_copy"] = f"ADJ_{row}"
     back = symbolic.reverse_mode_derivative(forward, inputs, seeds)
-    adjoint_before = {f"G_{row}": f"BG_{row}" for row in inputs}
+    adjoint_before = {f"ADJ_{row}": f"ADJ_BEFORE_{row}" for row in inputs}
     split = len(back) - len(inputs)  # the wanted adjoints come last, and get new names
     ends = [
-        (adjoint_before[target], e + (symbolic.symbol(target) if target.removeprefix("G_") in accumulated else 0))
+        (adjoint_before[target], e + (symbolic.symbol(target) if target.removeprefix("ADJ_") in accumulated else 0))
         for target, e in back[split:]
     ]
     return [*forward, *back[:split], *ends], adjoint_before

@@ -57,11 +57,11 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
     lines, propagation = symbolic.propagate_sample(model)
     more, results = linearised_filter_step(model, propagation, degree, follows_outputs=False)
     lines = [*lines, *more]
-    shown = f"SHOWN_{next(iter(model.outputs))}"
+    shown = f"Y_PRED_{next(iter(model.outputs))}"
     source = printer_numba.print_lane_loop(
         "finish", lines, results, layout, LANES, doc="Predict, and add the information."
     )
-    information_rows = [row for row in results if row.startswith("F_")]
+    information_rows = [row for row in results if row.startswith("INFORMATION_")]
     followed = {row: results[row] for row in (*path_rows, *information_rows, shown) if row in results}
     wanted = [*path_rows, *integrated, *inputs]
     back, adjoints = with_reverse(lines, followed, wanted)
@@ -69,12 +69,12 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
     n, m, steps = len(path_rows), len(integrated), model.substeps
     if integrated:
         source += variational_rk4.print_integrator(model, degree, layout, LANES)
-        step, ends = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_E" for name in integrated}
+        step, ends = variational_rk4.variational_rk4_step(model, degree), {name: f"{name}_END" for name in integrated}
         back, adjoints = with_reverse(step, ends, [*integrated, *inputs], inputs)
         source += printer_numba.print_lane_loop(
-            "move_back", back, adjoints, layout, LANES, ("T",), "The reverse of a Runge-Kutta step."
+            "move_back", back, adjoints, layout, LANES, ("TAU",), "The reverse of a Runge-Kutta step."
         )
-        started = {f"G_{i}": f"G_M_{i}" for i in model.states}
+        started = {f"ADJ_{i}": f"ADJ_M_{i}" for i in model.states}
         source += printer_numba.print_lane_loop("begin_back", [], started, layout, LANES, doc="The reverse of begin.")
     return source + _sample_source(n * LANES, m * LANES, layout[integrated[0]] * LANES if integrated else 0, steps)
 

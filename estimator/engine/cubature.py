@@ -58,21 +58,21 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
     active, faults = [], []
     for c, j in enumerate(names):
         variance = covariance(j, j)
-        tolerance = assign(f"MARGIN_{c}", PIVOT_TOLERANCE * variance)
+        tolerance = assign(f"TOLERANCE_{c}", PIVOT_TOLERANCE * variance)
         pivot = assign(f"PIVOT_{c}", variance - sum((factor[d, j] ** 2 for d in range(c)), ZERO))
-        is_active = assign(f"LIVES_{c}", select(pivot - tolerance, ONE, ZERO))
-        inverse = assign(f"INVERSE_{c}", is_active / sp.sqrt(select(is_active, pivot, ONE)))
+        is_active = assign(f"IS_ACTIVE_{c}", select(pivot - tolerance, ONE, ZERO))
+        inverse = assign(f"PIVOT_ROOT_INVERSE_{c}", is_active / sp.sqrt(select(is_active, pivot, ONE)))
         faults.append(is_negative(pivot + tolerance))
         factor[c, j] = assign(f"FACTOR_{c}_{j}", pivot * inverse)
         for i in names[c + 1 :]:
             rest = covariance(i, j) - sum((factor[d, i] * factor[d, j] for d in range(c)), ZERO)
-            rest = assign(f"REST_{c}_{i}", rest)
+            rest = assign(f"SCHUR_{c}_{i}", rest)
             factor[c, i] = assign(f"FACTOR_{c}_{i}", rest * inverse)
             faults.append(is_negative(tolerance * covariance(i, i) - (ONE - is_active) * rest**2))
         active.append(is_active)
-    n_active = assign("PAIRS", sum(active[:m], ZERO))
-    radius = assign("WIDTH", sp.sqrt(select(n_active, n_active, ONE)))
-    point_weight = assign("EACH", HALF / select(n_active, n_active, ONE))
+    n_active = assign("N_ACTIVE", sum(active[:m], ZERO))
+    radius = assign("RADIUS", sp.sqrt(select(n_active, n_active, ONE)))
+    point_weight = assign("POINT_WEIGHT", HALF / select(n_active, n_active, ONE))
     results = {}
     for c in range(m):
         # With no active column, two points stay at the mean.
@@ -81,14 +81,14 @@ def cubature_columns(model: Model) -> tuple[Assignments, dict[str, str]]:
         for i in names[:c]:
             results[f"L_{c}_{i}"] = "0.0"
         for i in names[c:]:
-            results[f"L_{c}_{i}"] = str(assign(f"WIDE_{c}_{i}", radius * factor[c, i]))
-    results["UNSOUND"] = str(assign("UNSOUND_e", symbol("UNSOUND") + sum(faults, ZERO)))
+            results[f"L_{c}_{i}"] = str(assign(f"SCALED_{c}_{i}", radius * factor[c, i]))
+    results["INDEFINITE_COUNT"] = str(assign("INDEFINITE_COUNT_e", symbol("INDEFINITE_COUNT") + sum(faults, ZERO)))
     return lines, results
 
 
 def point_names(model: Model) -> dict[str, str]:
     """Mover to its name at the current point."""
-    return {i: f"M_{i}" if i in model.states else f"X_{i}" for i in model.dynamic_names}
+    return {i: f"M_{i}" if i in model.states else f"POINT_{i}" for i in model.dynamic_names}
 
 
 def place_point(model: Model) -> tuple[Assignments, dict[str, str]]:
@@ -109,7 +109,7 @@ def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str
     named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     lines += substitute(named.items(), inputs | {i: f"{to}_e" for i, to in point_names(model).items()})
-    return lines, {f"I_P_{i}": f"NEXT_{i}" for i in model.states}
+    return lines, {f"IMAGE_P_{i}": f"NEXT_{i}" for i in model.states}
 
 
 def point_moments(model: Model) -> tuple[Assignments, Propagation]:
@@ -117,20 +117,20 @@ def point_moments(model: Model) -> tuple[Assignments, Propagation]:
     states, m = list(model.states), len(model.dynamic_names)
     lines: Assignments = []
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]
-    image = lambda p, i: symbol(f"I_{p}_{i}")  # noqa: E731
+    image = lambda p, i: symbol(f"IMAGE_{p}_{i}")  # noqa: E731
     for i in states:
         lines.append(
             (f"MIDDLE_{i}", sum((weight[c] * (image(2 * c, i) + image(2 * c + 1, i)) for c in range(m)), ZERO))
         )
-        lines += [(f"OFF_{p}_{i}", image(p, i) - symbol(f"MIDDLE_{i}")) for p in range(2 * m)]
-        lines += [(f"LEAN_{c}_{i}", weight[c] * (image(2 * c, i) - image(2 * c + 1, i))) for c in range(m)]
-    deviation = lambda p, i: symbol(f"OFF_{p}_{i}")  # noqa: E731
+        lines += [(f"DEVIATION_{p}_{i}", image(p, i) - symbol(f"MIDDLE_{i}")) for p in range(2 * m)]
+        lines += [(f"DIFFERENCE_{c}_{i}", weight[c] * (image(2 * c, i) - image(2 * c + 1, i))) for c in range(m)]
+    deviation = lambda p, i: symbol(f"DEVIATION_{p}_{i}")  # noqa: E731
     for a, i in enumerate(states):
         for k in states[a:]:
             total = sum((weight[p // 2] * deviation(p, i) * deviation(p, k) for p in range(2 * m)), ZERO)
-            lines.append((f"Q_{i}_{k}", total))
+            lines.append((f"P_PRED_{i}_{k}", total))
         for j in model.coefficients:
-            total = sum((symbol(f"LEAN_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
-            lines.append((f"Q_{i}_{j}", total))
+            total = sum((symbol(f"DIFFERENCE_{c}_{i}") * symbol(f"L_{c}_{j}") for c in range(m)), ZERO)
+            lines.append((f"P_PRED_{i}_{j}", total))
     at_mean = symbolic.propagate_sample(model)[1]
     return lines, Propagation(tuple(symbol(f"MIDDLE_{i}") for i in states), (), at_mean.noise_cov, at_mean.is_psd)

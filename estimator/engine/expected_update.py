@@ -70,10 +70,19 @@ def compile_expected_update(model: Model, degree: int = 0, lag: int = 0) -> Expe
             f"degree and lag must be 0 or 1, and lag 0 for a differential equation, but are {degree} and {lag}"
         )
     inputs = input_history_rows(model, degree, lag)
-    state_rows = [*model.states, *upper_triangle_names("P", model.names), *inputs, "COST", "BEGUN"]
+    state_rows = [*model.states, *upper_triangle_names("P", model.names), *inputs, "COST", "HAS_PENDING"]
     trajectory_rows = [f"{at}_{i}" for at in ("MIDDLE", "END") for i in model.states] if model.is_continuous else []
     layout = number_rows(
-        *state_rows, *trajectory_rows, "SHOWN", "SPREAD", "SURPRISE", "KNOWN", "SCORE", "MARGIN", "NEAR", "CELL"
+        *state_rows,
+        *trajectory_rows,
+        "Y_PRED",
+        "S_PRED",
+        "PENDING_VARIANCE",
+        "INFORMATION",
+        "SCORE",
+        "MARGIN",
+        "NEAR",
+        "CELL",
     )
     key = repr((model.digest, degree, lag))
     code = load_generated(
@@ -115,7 +124,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapp
     lines = wider + symbolic.substitute([*lines, *more], {**walked, **input_values})
     results = {row: walked.get(value, value) for row, value in results.items()}
     results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
-    noises = ["Q", *(f"R_{y}" for y in model.outputs)]
+    noises = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
     source = printer_numba.print_lane_loop(
         "expect", lines, results, layout, LANES, uniform, doc="One sample without data."
@@ -149,42 +158,46 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     symbol, names = symbolic.symbol, list(model.coefficients)
     k = len(names)
     cov = [[symbolic.symmetric_entry("P", i, j, names) for j in names] for i in names]
-    factor = [[symbol(f"M_{i}_{j}") if j <= i else sp.S.Zero for j in range(k)] for i in range(k)]
+    factor = [[symbol(f"FACTOR_{i}_{j}") if j <= i else sp.S.Zero for j in range(k)] for i in range(k)]
     lines: symbolic.Assignments = []
     product = {}  # the lower triangle of C M, which is enough for Mᵀ (C M)
     for j in range(k):
         for i in range(j, k):
-            lines.append((f"C_{i}_{j}", sum(cov[i][m] * factor[m][j] for m in range(j, k))))
-            product[i, j] = symbol(f"C_{i}_{j}")
+            lines.append((f"P_FACTOR_{i}_{j}", sum(cov[i][m] * factor[m][j] for m in range(j, k))))
+            product[i, j] = symbol(f"P_FACTOR_{i}_{j}")
     future_entries = {}
     for i in range(k):
         for j in range(i + 1):
             entry = sum(factor[m][i] * product[m, j] for m in range(i, k)) + (1 if i == j else 0)
-            lines.append((f"A_{i}_{j}", entry))
-            future_entries[i, j] = symbol(f"A_{i}_{j}")
-    with_future = ldl_factorise(future_entries, k, "J", allow_zero_pivots=True)
-    now = ldl_factorise({(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "N", allow_zero_pivots=True)
+            lines.append((f"WITH_FUTURE_{i}_{j}", entry))
+            future_entries[i, j] = symbol(f"WITH_FUTURE_{i}_{j}")
+    with_future = ldl_factorise(future_entries, k, "FUTURE_", allow_zero_pivots=True)
+    now = ldl_factorise(
+        {(i, j): cov[j][i] for i in range(k) for j in range(i + 1)}, k, "PRESENT_", allow_zero_pivots=True
+    )
     # Divisions take longest, so the two factorisations share them.
     both = dict(zip(map(str, with_future.inverse), zip(with_future.pivots, now.pivots, strict=True), strict=True))
     for (name, value), (name_now, value_now) in zip(with_future.lines, now.lines, strict=True):
         if name in both:
             first, second = both[name]
-            lines.append((f"SHARED_{name}", 1 / (first * second)))
-            value, value_now = symbol(f"SHARED_{name}") * second, symbol(f"SHARED_{name}") * first
+            lines.append((f"SHARED_INVERSE_{name}", 1 / (first * second)))
+            value, value_now = symbol(f"SHARED_INVERSE_{name}") * second, symbol(f"SHARED_INVERSE_{name}") * first
         lines += [(name, value), (name_now, value_now)]
-    lines += [("NOW", now.determinant), ("RATIO", with_future.determinant / symbol("NOW"))]
-    ratio = symbol("RATIO")
+    lines += [("PRESENT_DET", now.determinant), ("DET_RATIO", with_future.determinant / symbol("PRESENT_DET"))]
+    ratio = symbol("DET_RATIO")
     # `log` is for positive, normal numbers; comparisons with NaN are false.
     known = symbolic.select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
     known = symbolic.select(
-        symbol("NOW"), symbolic.select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)), sp.Float(DIVERGED_SCORE)
+        symbol("PRESENT_DET"),
+        symbolic.select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)),
+        sp.Float(DIVERGED_SCORE),
     )
     lines.append(("NATS", known))
     uniform = [str(factor[i][j]) for i in range(k) for j in range(i + 1)]
     source = printer_numba.print_lane_loop(
         "final_information_lanes",
         lines,
-        {"KNOWN": "NATS"},
+        {"INFORMATION": "NATS"},
         layout,
         LANES,
         uniform,

@@ -82,26 +82,28 @@ class GaussianUpdate:
         n = len(noise_cov)
         entries = {(a, b): noise_cov[a][b] for a in range(n) for b in range(a, n)}
         for a in range(n):
-            entries[a, a] = self.assign(f"SOUND_{a}_{a}", positive_part(entries[a, a]))
+            entries[a, a] = self.assign(f"Q_PSD_{a}_{a}", positive_part(entries[a, a]))
         remaining = dict(entries)  # the Schur complement
         for a in range(n - 1):
             for b in range(a + 1, n):
                 largest = self.assign(
-                    f"LARGEST_{a}_{b}",
+                    f"Q_LIMIT_{a}_{b}",
                     sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b])),
                 )
-                clipped = self.assign(f"KEPT_{a}_{b}", clip(remaining[a, b], -largest, largest))
+                clipped = self.assign(f"Q_CLIPPED_{a}_{b}", clip(remaining[a, b], -largest, largest))
                 entries[a, b] = (
-                    self.assign(f"SOUND_{a}_{b}", entries[a, b] + (clipped - remaining[a, b])) if a else clipped
+                    self.assign(f"Q_PSD_{a}_{b}", entries[a, b] + (clipped - remaining[a, b])) if a else clipped
                 )
                 remaining[a, b] = clipped
             inverse = (
-                self.assign(f"INVERSE_{a}", 1 / select(remaining[a, a], remaining[a, a], ONE)) if a < n - 2 else ZERO
+                self.assign(f"PIVOT_INVERSE_{a}", 1 / select(remaining[a, a], remaining[a, a], ONE))
+                if a < n - 2
+                else ZERO
             )
             for b in range(a + 1, n if a < n - 2 else 0):
                 for c in range(b, n):
                     remaining[b, c] = self.assign(
-                        f"REST_{a}_{b}_{c}", remaining[b, c] - remaining[a, b] * remaining[a, c] * inverse
+                        f"SCHUR_{a}_{b}_{c}", remaining[b, c] - remaining[a, b] * remaining[a, c] * inverse
                     )
         return tuple(tuple(entries[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
 
@@ -110,14 +112,14 @@ class GaussianUpdate:
         names, jacobian, rows = self.names, self.propagation.jacobian, self.transition_cov
         for a, i in enumerate(names):
             for j in names[a:]:
-                self.cov[i, j] = symmetric_entry("P" if i not in self.states else "Q", i, j, names)
+                self.cov[i, j] = symmetric_entry("P" if i not in self.states else "P_PRED", i, j, names)
         if not jacobian:
             return
         for i, slopes in zip(self.states, jacobian, strict=True):
             row = {}
             for j in names:
                 total = sum((a * symmetric_entry("P", k, j, names) for k, a in zip(names, slopes, strict=True)), ZERO)
-                row[j] = self.assign(f"B_{i}_{j}", total)
+                row[j] = self.assign(f"FP_{i}_{j}", total)
             rows[i] = row
         n = len(self.states)
         for a, i in enumerate(self.states):
@@ -126,7 +128,7 @@ class GaussianUpdate:
                 if a == b and not total.is_Symbol:
                     terms = (s**2 * symmetric_entry("P", k, k, names) for k, s in zip(names, jacobian[b], strict=True))
                     total += ROUNDING * sum(terms, ZERO)
-                self.cov[i, self.states[b]] = self.assign(f"Q_{i}_{self.states[b]}", total)
+                self.cov[i, self.states[b]] = self.assign(f"P_PRED_{i}_{self.states[b]}", total)
             for j in names[n:]:
                 self.cov[i, j] = rows[i][j]
 
@@ -154,11 +156,11 @@ class GaussianUpdate:
             ZERO,
         )
         remaining = self.assign(
-            "LEFT", sensor_variance - sum((h[i] * h[j] * known for (i, j), known in before.items()), ZERO)
+            "PENDING_LEFT", sensor_variance - sum((h[i] * h[j] * known for (i, j), known in before.items()), ZERO)
         )
-        smallest = self.assign("LITTLE", ROUNDING * sensor_variance)
-        return self.assign("TAKEN", shift) ** 2 / self.assign(
-            "LEAST", select(remaining - smallest, remaining, smallest)
+        smallest = self.assign("PENDING_FLOOR", ROUNDING * sensor_variance)
+        return self.assign("PENDING_SHIFT", shift) ** 2 / self.assign(
+            "PENDING_DIVISOR", select(remaining - smallest, remaining, smallest)
         )
 
     def output_process_noise(self, output_slope: Sequence[sp.Expr]) -> sp.Expr:
@@ -175,9 +177,9 @@ class GaussianUpdate:
         cross_cov = {}
         for i in self.names:
             total = sum((h * self[i, j] for j, h in zip(self.names, output_slope, strict=True)), ZERO)
-            cross_cov[i] = self.assign(f"C{tag}_{i}", total)
+            cross_cov[i] = self.assign(f"PH{tag}_{i}", total)
         s = sum((h * cross_cov[i] for i, h in zip(self.names, output_slope, strict=True)), ZERO)
-        return cross_cov, self.assign(f"S{tag}", s)
+        return cross_cov, self.assign(f"HPH{tag}", s)
 
     def add_process_noise(self, process_variance: sp.Expr) -> None:
         """Add the process noise: Q + N ``process_variance`` in the states' block."""
@@ -185,7 +187,7 @@ class GaussianUpdate:
             for b in range(a, len(self.states)):
                 k, unit_noise = self.states[b], self.propagation.noise_cov[a][b]
                 if unit_noise != 0:
-                    self.cov[i, k] = self.assign(f"R_{i}_{k}", self.cov[i, k] + process_variance * unit_noise)
+                    self.cov[i, k] = self.assign(f"P_NOISY_{i}_{k}", self.cov[i, k] + process_variance * unit_noise)
 
     def condition(
         self,
@@ -218,8 +220,8 @@ class GaussianUpdate:
         }
         for i in self.names:
             if cross_cov[i] != 0 and scaled_innovation != 0:
-                self.mean[i] = self.assign(f"M{tag}_{i}", self.mean[i] + cross_cov[i] * scaled_innovation)
-        rounding_factor = self.assign(f"GROWN{tag}", 1 + sp.Float(ROUNDING) * is_observed)
+                self.mean[i] = self.assign(f"MEAN{tag}_{i}", self.mean[i] + cross_cov[i] * scaled_innovation)
+        rounding_factor = self.assign(f"ROUNDING{tag}", 1 + sp.Float(ROUNDING) * is_observed)
         for (i, j), value in list(self.cov.items()):
             factor = rounding_factor if i == j else ONE
             if measured_quantity in (i, j):
@@ -255,22 +257,22 @@ def belief_update(
         k for k in range(model.n_outputs) if g.output_process_noise(g.predicted_output(k, degree)[1]) != 0
     ][:1]
     if not informative_sensor:  # no sensor informs γ: its prior mean acts
-        g.add_process_noise(g.assign("Q_unseen", symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")))
+        g.add_process_noise(g.assign("PROCESS_VARIANCE_UNSEEN", symbol("GAMMA_RATE") / symbol("GAMMA_SHAPE")))
     for k, sensor in enumerate(model.outputs):
         tag, y = str(k), symbol(f"Y_{sensor}")
         expected, output_slope = g.predicted_output(k, degree)
-        expected = g.assign(f"Y{tag}", expected)
+        expected = g.assign(f"Y_PRED{tag}", expected)
         cross_cov, s = g.innovation_covariance(output_slope, tag)
-        output_noise = g.assign(f"N{tag}", g.output_process_noise(output_slope)) if k in informative_sensor else ZERO
-        is_observed = g.assign(f"Z{tag}", is_present(y)) if may_be_missing else ONE
-        e = g.assign(f"E{tag}", select(is_observed, y - expected, ZERO) if may_be_missing else y - expected)
+        output_noise = g.assign(f"HQH{tag}", g.output_process_noise(output_slope)) if k in informative_sensor else ZERO
+        is_observed = g.assign(f"OBSERVED{tag}", is_present(y)) if may_be_missing else ONE
+        e = g.assign(f"INNOVATION{tag}", select(is_observed, y - expected, ZERO) if may_be_missing else y - expected)
         noise_iterations = iterate_noise_beliefs(g.lines, tag, sensor, (s, e, output_noise, is_observed), iterations)
         last = noise_iterations[-1]
         if output_noise != 0:
             noise_cross_cov = {i: sum((output_slope[b] * n for b, n in enumerate(row)), ZERO)
                      for i, row in zip(g.states, g.propagation.noise_cov, strict=True)}  # fmt: skip
             cross_cov |= {
-                i: g.assign(f"D{tag}_{i}", cross_cov[i] + last.process_variance * part)
+                i: g.assign(f"PH_NOISY{tag}_{i}", cross_cov[i] + last.process_variance * part)
                 for i, part in noise_cross_cov.items()
                 if part != 0
             }
@@ -284,9 +286,9 @@ def belief_update(
             f"XI_RATE_{sensor}": print_expression(last.xi_rate),
         }
         retained_fraction = last.r * last.inverse_innovation_cov
-        inverse_innovation_cov = g.assign(f"W{tag}", is_observed * last.inverse_innovation_cov)
+        inverse_innovation_cov = g.assign(f"S_INVERSE_OBSERVED{tag}", is_observed * last.inverse_innovation_cov)
         retained_fraction = g.assign(
-            f"H{tag}", select(is_observed, retained_fraction, ONE) if may_be_missing else retained_fraction
+            f"R_OVER_S{tag}", select(is_observed, retained_fraction, ONE) if may_be_missing else retained_fraction
         )
         g.condition(
             output_slope, cross_cov, inverse_innovation_cov, last.scaled_innovation, retained_fraction, tag, is_observed
@@ -308,21 +310,28 @@ def update_without_data(model: Model, propagation: Propagation, degree: int) -> 
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}
-    g.add_process_noise(symbol("Q"))
+    g.add_process_noise(symbol("PROCESS_VARIANCE"))
     for k, sensor in enumerate(model.outputs):
         tag, r = str(k), symbol(f"R_{sensor}")
         expected, output_slope = g.predicted_output(k, degree)
         cross_cov, s = g.innovation_covariance(output_slope, tag)
-        inverse_innovation_cov = g.assign(f"L{tag}", 1 / (s + r))
+        inverse_innovation_cov = g.assign(f"S_INVERSE{tag}", 1 / (s + r))
         if k == 0:
-            pending_variance = g.assign("MOVED", symbol("BEGUN") * g.pending_output_variance(output_slope, r))
+            pending_variance = g.assign(
+                "PENDING_PRODUCT", symbol("HAS_PENDING") * g.pending_output_variance(output_slope, r)
+            )
             results |= {
-                "SHOWN": print_expression(g.assign("Y0", expected)),
-                "SPREAD": print_expression(g.assign("V0", s + r)),
+                "Y_PRED": print_expression(g.assign("Y_PRED0", expected)),
+                "S_PRED": print_expression(g.assign("S0", s + r)),
             }
-            results |= {"SURPRISE": print_expression(pending_variance), "BEGUN": "1.0"}
+            results |= {"PENDING_VARIANCE": print_expression(pending_variance), "HAS_PENDING": "1.0"}
         g.condition(
-            output_slope, cross_cov, inverse_innovation_cov, ZERO, g.assign(f"H{tag}", r * inverse_innovation_cov), tag
+            output_slope,
+            cross_cov,
+            inverse_innovation_cov,
+            ZERO,
+            g.assign(f"R_OVER_S{tag}", r * inverse_innovation_cov),
+            tag,
         )
     found = g.row_results()
     return g.lines, results | {row: value for row, value in found.items() if row not in model.coefficients}

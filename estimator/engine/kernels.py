@@ -142,8 +142,8 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
     names = cubature_order(model)
     point_layout: dict[str, int | str] = dict(layout)
     point_layout |= {f"L_C_{i}": f"{layout[f'L_0_{names[0]}']} + C*{len(names)} + {k}" for k, i in enumerate(names)}
-    first = layout[f"I_0_{next(iter(model.states))}"]
-    point_layout |= {f"I_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
+    first = layout[f"IMAGE_0_{next(iter(model.states))}"]
+    point_layout |= {f"IMAGE_P_{i}": f"{first} + P*{model.n_states} + {k}" for k, i in enumerate(model.states)}
 
     def loop(name: str, lines: Any, results: Any, uniform: tuple[str, ...], doc: str) -> str:
         return printer_numba.print_lane_loop(name, lines, results, point_layout, lanes, uniform, doc)
@@ -158,19 +158,19 @@ def _cubature_source(model: Model, degree: int, layout: Mapping[str, int], lanes
         sample = cubature.propagate_point_difference(model)
         source += loop("propagate_point", *sample, ("C", "SIGN", "P"), "One point over the sample.")
         return source + _loop_over_points(model, "", "        propagate_point(W, P // 2, 1.0 - 2.0 * (P % 2), P)\n")
-    noise = [name for name in integrator_rows(model) if name[0] != "S"]
+    noise = [name for name in integrator_rows(model) if not name.startswith("F_")]
     start = {
         i: printer_numba.print_expression(value) for i, value in symbolic.integrator_start(model).items() if i in noise
     }
     source += loop("begin", [], start, (), "The mean, and its process noise.")
     step = variational_rk4.variational_rk4_step(model, degree)
     source += loop(
-        "step_mean_and_noise", step, {i: f"{i}_E" for i in noise}, ("T",), "One Runge-Kutta step of mean and noise."
+        "step_mean_and_noise", step, {i: f"{i}_END" for i in noise}, ("TAU",), "One Runge-Kutta step of mean and noise."
     )
     source += loop("place_point", *cubature.place_point(model), ("C", "SIGN"), "A point at the start of the sample.")
-    step, moved = cubature.propagate_point(model, degree), {f"M_{i}": f"M_{i}_E" for i in model.states}
-    source += loop("move", step, moved, ("T",), "One Runge-Kutta step of a point.")
-    source += loop("keep_image", [], {f"I_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
+    step, moved = cubature.propagate_point(model, degree), {f"M_{i}": f"M_{i}_END" for i in model.states}
+    source += loop("move", step, moved, ("TAU",), "One Runge-Kutta step of a point.")
+    source += loop("keep_image", [], {f"IMAGE_P_{i}": f"M_{i}" for i in model.states}, ("P",), "A point at the end.")
     n = model.substeps
     noise_loop = f"    begin(W)\n    for s in range({n}):\n        step_mean_and_noise(W, s / {n})\n"
     body = "        place_point(W, P // 2, 1.0 - 2.0 * (P % 2))\n"
@@ -222,7 +222,7 @@ def compile_linearised_filter(
 
         lines, propagation = symbolic.propagate_sample(model)
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
-        span = symbolic.symbol("SPAN") if variable_step else symbolic.ONE
+        span = symbolic.symbol("SAMPLE_LENGTH") if variable_step else symbolic.ONE
         source = variational_rk4.print_integrator(model, degree, layout, lanes, sample_length=span)
         source += printer_numba.print_lane_loop(
             "finish", lines + more, results, layout, lanes, doc="Predict, and add likelihood and information."

@@ -49,22 +49,22 @@ def linearised_filter_step(
     for a, i in enumerate(states):
         row = {
             k: assign(
-                f"B_{i}_{k}",
-                sum((propagation.jacobian[a][m] * symmetric_entry("V", states[m], k, states) for m in range(n)), ZERO),
+                f"FP_{i}_{k}",
+                sum((propagation.jacobian[a][m] * symmetric_entry("P", states[m], k, states) for m in range(n)), ZERO),
             )
             for k in states
         }
         for b in range(a, n):
             total = sum(
                 (propagation.jacobian[b][m] * row[states[m]] for m in range(n)),
-                symbol("Q") * propagation.noise_cov[a][b],
+                symbol("PROCESS_VARIANCE") * propagation.noise_cov[a][b],
             )
-            cov[i, states[b]] = assign(f"W_{i}_{states[b]}", total)
+            cov[i, states[b]] = assign(f"P_PRED_{i}_{states[b]}", total)
     state_sensitivity = {
         (i, c): assign(
-            f"X_{i}_{c}",
+            f"DX_PRED_{i}_{c}",
             sum(
-                (propagation.jacobian[a][m] * symbol(f"Z_{states[m]}_{c}") for m in range(n)),
+                (propagation.jacobian[a][m] * symbol(f"DX_{states[m]}_{c}") for m in range(n)),
                 propagation.jacobian[a][n + b],
             ),
         )
@@ -78,44 +78,46 @@ def linearised_filter_step(
     for k, sensor in enumerate(model.outputs):
         tag = str(k)
         at_mean = {symbol(i): value for i, value in mean.items()} | {symbol("u"): input_at_end(model, degree)}
-        predicted_output = assign(f"Y{tag}", found.outputs[k].xreplace(at_mean))
+        predicted_output = assign(f"Y_PRED{tag}", found.outputs[k].xreplace(at_mean))
         h = [slope.xreplace(at_mean) for slope in found.output_slopes[k]]
-        cross_cov = {i: assign(f"C{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
-        state_part_variance = assign(f"G{tag}", sum((h[m] * cross_cov[states[m]] for m in range(n)), ZERO))
+        cross_cov = {i: assign(f"PH{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
+        state_part_variance = assign(f"HPH{tag}", sum((h[m] * cross_cov[states[m]] for m in range(n)), ZERO))
         innovation_variance = assign(f"S{tag}", state_part_variance + symbol(f"R_{sensor}"))
-        inverse_innovation_variance = assign(f"L{tag}", 1 / innovation_variance)
+        inverse_innovation_variance = assign(f"S_INVERSE{tag}", 1 / innovation_variance)
         output_sensitivity = {
-            name: assign(f"T{tag}_{name}", sum((h[m] * state_sensitivity[states[m], name] for m in range(n)), h[n + b]))
+            name: assign(
+                f"DY{tag}_{name}", sum((h[m] * state_sensitivity[states[m], name] for m in range(n)), h[n + b])
+            )
             for b, name in enumerate(coefficients)
         }
-        counted = assign(f"I{tag}", symbol("LIVE") * inverse_innovation_variance)
+        counted = assign(f"S_INVERSE_COUNTED{tag}", symbol("IS_COUNTED") * inverse_innovation_variance)
         weighted_sensitivity = {
-            name: assign(f"U{tag}_{name}", counted * output_sensitivity[name]) for name in coefficients
+            name: assign(f"DY_OVER_S{tag}_{name}", counted * output_sensitivity[name]) for name in coefficients
         }
         for b, name in enumerate(coefficients):
             for other in coefficients[b:]:
-                totals[f"F_{name}_{other}"] += weighted_sensitivity[name] * output_sensitivity[other]
-        innovation = assign(f"E{tag}", symbol(f"Y_{sensor}") - predicted_output) if follows_outputs else ZERO
+                totals[f"INFORMATION_{name}_{other}"] += weighted_sensitivity[name] * output_sensitivity[other]
+        innovation = assign(f"INNOVATION{tag}", symbol(f"Y_{sensor}") - predicted_output) if follows_outputs else ZERO
         if follows_outputs:
-            misfit = assign(f"D{tag}", counted * innovation**2)
-            totals["LOSS"] += HALF * (misfit - symbol("LIVE") * sp.log(inverse_innovation_variance))
-            totals["MISFIT"] += misfit
+            misfit = assign(f"NIS{tag}", counted * innovation**2)
+            totals["LOSS"] += HALF * (misfit - symbol("IS_COUNTED") * sp.log(inverse_innovation_variance))
+            totals["NIS"] += misfit
             for name in coefficients:
-                totals[f"SLOPE_{name}"] -= weighted_sensitivity[name] * innovation
-            results[f"SPREAD_{sensor}"] = print_expression(state_part_variance)
+                totals[f"GRADIENT_{name}"] -= weighted_sensitivity[name] * innovation
+            results[f"HPH_{sensor}"] = print_expression(state_part_variance)
         elif k == 0:
-            results["SPREAD"] = print_expression(innovation_variance)
-        results[f"SHOWN_{sensor}"] = print_expression(predicted_output)
+            results["S_PRED"] = print_expression(innovation_variance)
+        results[f"Y_PRED_{sensor}"] = print_expression(predicted_output)
         gain = {i: assign(f"K{tag}_{i}", inverse_innovation_variance * cross_cov[i]) for i in states}
-        mean = {i: assign(f"J{tag}_{i}", mean[i] + gain[i] * innovation) for i in states}
+        mean = {i: assign(f"MEAN{tag}_{i}", mean[i] + gain[i] * innovation) for i in states}
         state_sensitivity = {
-            (i, name): assign(f"O{tag}_{i}_{name}", state_sensitivity[i, name] - gain[i] * output_sensitivity[name])
+            (i, name): assign(f"DX{tag}_{i}_{name}", state_sensitivity[i, name] - gain[i] * output_sensitivity[name])
             for i, name in state_sensitivity
         }
         cov = {(i, j): assign(f"P{tag}_{i}_{j}", value - gain[i] * cross_cov[j]) for (i, j), value in cov.items()}
     results |= {i: print_expression(mean[i]) for i in states}
-    results |= {f"V_{i}_{j}": print_expression(value) for (i, j), value in cov.items()}
-    results |= {f"Z_{i}_{name}": print_expression(value) for (i, name), value in state_sensitivity.items()}
+    results |= {f"P_{i}_{j}": print_expression(value) for (i, j), value in cov.items()}
+    results |= {f"DX_{i}_{name}": print_expression(value) for (i, name), value in state_sensitivity.items()}
     for name, total in totals.items():
         if total != symbol(name):
             results[name] = print_expression(assign(f"{name}_e", total))

@@ -73,8 +73,8 @@ def compile_noise_free_response(model: Model, degree: int = 0, lag: int = 0, lan
         lanes: lanes of a block.
     """
     coarse = with_coarse_substeps(model)
-    names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "SHOWN"]
-    names += [f"{letter}_{c}" for letter in ("PHI", "E") for c in model.coefficients]
+    names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "Y_PRED"]
+    names += [f"{letter}_{c}" for letter in ("PHI", "REGRESSOR") for c in model.coefficients]
     names += [f"A_{i}_{j}" for i in model.states for j in model.states]
     layout = number_rows(*names, *integrator_rows(model))
     key = repr((coarse.digest, degree, lag, lanes))
@@ -102,24 +102,25 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     source = loop(
         "output_now",
         "The output now, without input.",
-        symbolic.eliminate_common_subexpressions(values, "W"),
+        symbolic.eliminate_common_subexpressions(values, "CSE"),
         {n.removesuffix("_e"): n for n in values},
     )
     source += variational_rk4.print_integrator(model, degree, layout, lanes, input_values=input_values)
     source += _step_source(model, degree, lag, loop)
     constant_input = {symbol("u1"): symbol("u"), symbol("u2"): symbol("u")}
     summed = {
-        f"R_{c}": sum(m.diff(symbol(c)) for m in derivatives.moves).xreplace(constant_input) for c in model.coefficients
+        f"SUM_{c}": sum(m.diff(symbol(c)) for m in derivatives.moves).xreplace(constant_input)
+        for c in model.coefficients
     }
-    lines = symbolic.substitute(symbolic.eliminate_common_subexpressions(summed, "W"), {"u": "INPUT"})
-    source += loop("regressors", "The regressors.", lines, {f"E_{c}": f"R_{c}" for c in model.coefficients})
+    lines = symbolic.substitute(symbolic.eliminate_common_subexpressions(summed, "CSE"), {"u": "INPUT"})
+    source += loop("regressors", "The regressors.", lines, {f"REGRESSOR_{c}": f"SUM_{c}" for c in model.coefficients})
     rest = {symbol(name): 0 for name in (*model.states, "u", "u1", "u2")}
     slopes = {
-        f"L_{i}_{j}": slope.subs(rest)
+        f"SLOPE_{i}_{j}": slope.subs(rest)
         for i, row in zip(model.states, derivatives.jacobian, strict=True)
         for j, slope in zip(model.states, row, strict=False)
     }
-    results = {f"A_{name[2:]}": name for name in slopes}
+    results = {f"A_{name.removeprefix('SLOPE_')}": name for name in slopes}
     source += loop("linearise", "The linear part.", list(slopes.items()), results)
     mirrored = {symbol(name): -symbol(name) for name in (*model.states, "u", "u1", "u2")}
     is_odd = all((e + e.xreplace(mirrored)).expand() == 0 for e in (*derivatives.moves, *derivatives.outputs))
@@ -134,9 +135,13 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     inputs = input_history_rows(model, degree, lag)
     source, (lines, propagation) = "", symbolic.propagate_sample(model)
     if model.is_continuous:
-        point = {f"M_{x}": f"M_{x}_E" for x in states}
+        point = {f"M_{x}": f"M_{x}_END" for x in states}
         source += loop(
-            "move_state", "One Runge-Kutta step of the state alone.", symbolic.state_rk4_step(model, degree), point, "T"
+            "move_state",
+            "One Runge-Kutta step of the state alone.",
+            symbolic.state_rk4_step(model, degree),
+            point,
+            "TAU",
         )
     at = dict(zip(map(symbol, states), propagation.state, strict=True)) | {
         symbol("u"): symbolic.input_at_end(model, degree)
@@ -148,10 +153,10 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
         sum((output_slope[a] * propagation.jacobian[a][n + b] for a in range(n)), output_slope[n + b])
         for b in range(model.n_coefficients)
     ]
-    source += loop("output", "The output after the sample.", [*lines, ("SHOWN_e", shown)], {"SHOWN": "SHOWN_e"})
-    more = [("SHOWN_e", shown), *((f"PHI_{c}_e", e) for c, e in zip(model.coefficients, phi, strict=True))]
+    source += loop("output", "The output after the sample.", [*lines, ("Y_PRED_e", shown)], {"Y_PRED": "Y_PRED_e"})
+    more = [("Y_PRED_e", shown), *((f"PHI_{c}_e", e) for c, e in zip(model.coefficients, phi, strict=True))]
     more += [(f"END_{x}", value) for x, value in zip(states, propagation.state, strict=True)]
-    results = {row: f"{row}_e" for row in ("SHOWN", *(f"PHI_{c}" for c in model.coefficients))}
+    results = {row: f"{row}_e" for row in ("Y_PRED", *(f"PHI_{c}" for c in model.coefficients))}
     results |= {x: f"END_{x}" for x in states}
     results |= {older: newer for newer, older in pairwise(inputs)}
     source += loop("finish", "The output after the sample, and its derivatives.", [*lines, *more], results)

@@ -53,27 +53,36 @@ def iterate_noise_beliefs(
     s, e, output_noise, is_observed = scalars
     gamma_rate, xi_rate = symbol("GAMMA_RATE"), symbol(f"XI_RATE_{sensor}")
     gamma_shape, xi_shape = symbol("GAMMA_SHAPE"), symbol(f"XI_SHAPE_{sensor}")
-    half_count = program.assign(f"U{tag}", HALF * is_observed)
-    new_gamma_shape = program.assign(f"F{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
-    new_xi_shape = program.assign(f"X{tag}", xi_shape + half_count)
+    half_count = program.assign(f"HALF_COUNT{tag}", HALF * is_observed)
+    new_gamma_shape = (
+        program.assign(f"NEW_GAMMA_SHAPE{tag}", gamma_shape + half_count) if output_noise != 0 else gamma_shape
+    )
+    new_xi_shape = program.assign(f"NEW_XI_SHAPE{tag}", xi_shape + half_count)
     # Every iteration has the same shapes, and divisions take long.
-    inverse_gamma_shape = program.assign(f"V{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
-    inverse_xi_shape = program.assign(f"A{tag}", 1 / new_xi_shape)
-    process_variance = program.assign(f"B{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO
+    inverse_gamma_shape = (
+        program.assign(f"GAMMA_SHAPE_INVERSE{tag}", 1 / new_gamma_shape) if output_noise != 0 else ZERO
+    )
+    inverse_xi_shape = program.assign(f"XI_SHAPE_INVERSE{tag}", 1 / new_xi_shape)
+    process_variance = (
+        program.assign(f"PROCESS_VARIANCE{tag}_0", gamma_rate / gamma_shape) if output_noise != 0 else ZERO
+    )
     r = program.assign(f"R{tag}_0", xi_rate / xi_shape)
     noise_iterations = []
     for i in range(iterations):
-        q = program.assign(f"Q{tag}_{i}", output_noise * process_variance)
-        inverse_innovation_cov = program.assign(f"L{tag}_{i}", 1 / (s + q + r))
-        scaled_innovation = program.assign(f"J{tag}_{i}", e * inverse_innovation_cov)
-        square = program.assign(f"T{tag}_{i}", scaled_innovation**2)
+        q = program.assign(f"Q_OUTPUT{tag}_{i}", output_noise * process_variance)
+        inverse_innovation_cov = program.assign(f"S_INVERSE{tag}_{i}", 1 / (s + q + r))
+        scaled_innovation = program.assign(f"INNOVATION_OVER_S{tag}_{i}", e * inverse_innovation_cov)
+        square = program.assign(f"INNOVATION_OVER_S_SQUARED{tag}_{i}", scaled_innovation**2)
         new_gamma_rate, new_xi_rate = (
             program.assign(
                 f"{letter}{tag}_{i}", rate + half_count * variance * (v * square + (1 - v * inverse_innovation_cov))
             )
             if v != 0
             else rate
-            for letter, rate, variance, v in (("G", gamma_rate, process_variance, q), ("O", xi_rate, r, r))
+            for letter, rate, variance, v in (
+                ("NEW_GAMMA_RATE", gamma_rate, process_variance, q),
+                ("NEW_XI_RATE", xi_rate, r, r),
+            )
         )
         noise_iterations.append(
             NoiseIteration(
@@ -89,7 +98,9 @@ def iterate_noise_beliefs(
             )
         )
         process_variance = (
-            program.assign(f"B{tag}_{i + 1}", new_gamma_rate * inverse_gamma_shape) if output_noise != 0 else ZERO
+            program.assign(f"PROCESS_VARIANCE{tag}_{i + 1}", new_gamma_rate * inverse_gamma_shape)
+            if output_noise != 0
+            else ZERO
         )
         r = program.assign(f"R{tag}_{i + 1}", new_xi_rate * inverse_xi_shape)
     return noise_iterations

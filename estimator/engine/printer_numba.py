@@ -102,14 +102,14 @@ def print_lane_loop(
     clashing = sorted({target for target, _ in kept} & set(layout))
     if clashing:
         raise ValueError(f"{name} assigns {clashing}, which are rows; give the results other names first")
-    read = sorted(used - set(uniform), key=lambda row: (str(layout.get(row.removeprefix("G_"))), row))
-    adjoint = any(row not in layout and row.removeprefix("G_") in layout for row in (*read, *results))
+    read = sorted(used - set(uniform), key=lambda row: (str(layout.get(row.removeprefix("ADJ_"))), row))
+    adjoint = any(row not in layout and row.removeprefix("ADJ_") in layout for row in (*read, *results))
 
     def entry(row: str) -> str:
         """A row's entry; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
         if shared_rows and row in shared_rows:
             return f"B[{shared_rows[row] * lanes}{' + LANE' if lanes > 1 else ''}]"
-        block, bare = ("W", row) if row in layout else ("A", row.removeprefix("G_"))
+        block, bare = ("W", row) if row in layout else ("A", row.removeprefix("ADJ_"))
         if bare not in layout:
             raise ValueError(
                 f"{name} uses {row}, which is neither assigned, nor a row, nor an argument; add it to the layout"

@@ -32,8 +32,10 @@ def integrator_rows(model: Model) -> list[str]:
     """
     if not model.is_continuous:
         return []
-    names = [f"M_{i}" for i in model.states] + [f"S_{i}_{j}" for i in model.states for j in model.dynamic_names]
-    return names + ([f"D_{i}" for i in model.states] if model.held else upper_triangle_names("N", model.states))
+    names = [f"M_{i}" for i in model.states] + [f"F_{i}_{j}" for i in model.states for j in model.dynamic_names]
+    return names + (
+        [f"NOISE_INPUT_{i}" for i in model.states] if model.held else upper_triangle_names("Q", model.states)
+    )
 
 
 def update_layout(model: Model, degree: int) -> dict[str, int]:
@@ -50,10 +52,10 @@ def cubature_order(model: Model) -> list[str]:
 def cubature_rows(model: Model) -> list[str]:
     """Rows of the sigma points (`estimator.engine.cubature`)."""
     columns, movers = range(len(model.dynamic_names)), model.dynamic_names
-    images = [f"I_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
-    at_point = [f"X_{i}" for i in movers if i not in model.states]
+    images = [f"IMAGE_{p}_{i}" for p in range(2 * len(columns)) for i in model.states]
+    at_point = [f"POINT_{i}" for i in movers if i not in model.states]
     factor = [f"L_{c}_{i}" for c in columns for i in cubature_order(model)]
-    return [*factor, *(f"WEIGHT_{c}" for c in columns), *at_point, *images, "UNSOUND"]
+    return [*factor, *(f"WEIGHT_{c}" for c in columns), *at_point, *images, "INDEFINITE_COUNT"]
 
 
 def trace_rows(model: Model, iterations: int) -> list[str]:
@@ -67,17 +69,17 @@ def trace_rows(model: Model, iterations: int) -> list[str]:
 
 def filter_state_rows(model: Model) -> list[str]:
     """State of the linearised filter: mean, covariance V, and sensitivities Z to the coefficients."""
-    sensitivities = [f"Z_{i}_{c}" for i in model.states for c in model.coefficients]
-    return [*model.states, *upper_triangle_names("V", model.states), *sensitivities]
+    sensitivities = [f"DX_{i}_{c}" for i in model.states for c in model.coefficients]
+    return [*model.states, *upper_triangle_names("P", model.states), *sensitivities]
 
 
 def likelihood_rows(model: Model) -> list[str]:
     """Totals of the linearised filter: minus the log likelihood, its gradient, the Fisher information, and Σ ν²/S."""
     return [
         "LOSS",
-        *(f"SLOPE_{c}" for c in model.coefficients),
-        *upper_triangle_names("F", model.coefficients),
-        "MISFIT",
+        *(f"GRADIENT_{c}" for c in model.coefficients),
+        *upper_triangle_names("INFORMATION", model.coefficients),
+        "NIS",
     ]
 
 
@@ -85,8 +87,15 @@ def linearised_filter_layout(
     model: Model, degree: int, follows_outputs: bool, variable_step: bool = False
 ) -> dict[str, int]:
     """Rows of the linearised filter's block; ``SPAN`` is the length of a sample, if it varies."""
-    seen = [f"{what}_{y}" for what in ("Y", "SHOWN", "SPREAD") for y in model.outputs]
-    shown = seen if follows_outputs else [*(f"SHOWN_{y}" for y in model.outputs), "SPREAD"]
-    given = [*model.coefficients, *input_rows(model, degree), *shown, "LIVE", "Q", *(f"R_{y}" for y in model.outputs)]
-    given += ["SPAN"] if variable_step else []
+    seen = [f"{what}_{y}" for what in ("Y", "Y_PRED", "HPH") for y in model.outputs]
+    shown = seen if follows_outputs else [*(f"Y_PRED_{y}" for y in model.outputs), "S_PRED"]
+    given = [
+        *model.coefficients,
+        *input_rows(model, degree),
+        *shown,
+        "IS_COUNTED",
+        "PROCESS_VARIANCE",
+        *(f"R_{y}" for y in model.outputs),
+    ]
+    given += ["SAMPLE_LENGTH"] if variable_step else []
     return number_rows(*filter_state_rows(model), *likelihood_rows(model), *given, *integrator_rows(model))

@@ -175,15 +175,15 @@ def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagatio
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
     for i, row in zip(model.states, c.jacobian, strict=True):
-        named |= {f"S_{i}_{j}": slope for j, slope in zip(model.dynamic_names, row, strict=True)}
-    lines = substitute(eliminate_common_subexpressions(named, "W"), inputs)
+        named |= {f"F_{i}_{j}": slope for j, slope in zip(model.dynamic_names, row, strict=True)}
+    lines = substitute(eliminate_common_subexpressions(named, "CSE"), inputs)
     # A number or a bare symbol needs no assignment.
-    trivial = {name: e for name, e in lines if name[0] in "MS" and (e.is_Number or e.is_Symbol)}
+    trivial = {name: e for name, e in lines if name.startswith(("M_", "F_")) and (e.is_Number or e.is_Symbol)}
     lines = [(name, e) for name, e in lines if name not in trivial]
     value = lambda name: trivial.get(name, symbol(name))  # noqa: E731
     is_dynamic = dict.fromkeys(model.names, False) | dict.fromkeys(model.dynamic_names, True)
     jacobian = tuple(
-        tuple(value(f"S_{i}_{j}") if is_dynamic[j] else sp.S.Zero for j in model.names) for i in model.states
+        tuple(value(f"F_{i}_{j}") if is_dynamic[j] else sp.S.Zero for j in model.names) for i in model.states
     )
     noise = tuple(tuple(a * b for b in c.noise) for a in c.noise)
     return lines, Propagation(tuple(value(f"M_{i}") for i in model.states), jacobian, noise)
@@ -193,7 +193,7 @@ def integrator_start(model: Model) -> dict[str, sp.Expr]:
     """The integrator's quantities at the start of a sample."""
     start: dict[str, sp.Expr] = dict.fromkeys(integrator_rows(model), sp.S.Zero)
     for i in model.states:
-        start |= {f"M_{i}": symbol(i), f"S_{i}_{i}": sp.S.One}
+        start |= {f"M_{i}": symbol(i), f"F_{i}_{i}": sp.S.One}
     return start
 
 
@@ -201,12 +201,12 @@ def integrator_end(model: Model) -> Propagation:
     """The dynamics over a sample, from the integrator's quantities at its end."""
     states = list(model.states)
     jacobian = tuple(
-        tuple(symbol(f"S_{i}_{j}") if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states
+        tuple(symbol(f"F_{i}_{j}") if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states
     )
     if model.held:
-        noise = tuple(tuple(symbol(f"D_{i}") * symbol(f"D_{k}") for k in states) for i in states)
+        noise = tuple(tuple(symbol(f"NOISE_INPUT_{i}") * symbol(f"NOISE_INPUT_{k}") for k in states) for i in states)
     else:
-        noise = tuple(tuple(symmetric_entry("N", i, k, states) for k in states) for i in states)
+        noise = tuple(tuple(symmetric_entry("Q", i, k, states) for k in states) for i in states)
     return Propagation(tuple(symbol(f"M_{i}") for i in states), jacobian, noise, is_psd=model.held)
 
 
@@ -233,7 +233,7 @@ def runge_kutta_4(
     rates: list[dict[str, sp.Expr]] = []
     for k, fraction in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
         tag = "ABCD"[k]
-        at: dict[str, sp.Expr | str] = {"u": f"V_{tag if k != 2 else 'B'}"}
+        at: dict[str, sp.Expr | str] = {"u": f"U_AT_{tag if k != 2 else 'B'}"}
         for name in variables:
             if k:
                 lines.append((f"{name}_{tag}", symbol(name) + fraction * h * rates[-1][name]))
@@ -241,17 +241,18 @@ def runge_kutta_4(
         rename = {name: f"{name}_{tag}" for name, _ in rate_assignments}
         stage_rates: dict[str, sp.Expr] = {}
         for name, expression in substitute(rate_assignments, {**rename, **at}):
-            if name.startswith("K_") and (expression.is_Symbol or expression.is_Number):
-                stage_rates[name[2 : -len(tag) - 1]] = expression
+            if name.startswith("RATE_") and (expression.is_Symbol or expression.is_Number):
+                stage_rates[name[len("RATE_") : -len(tag) - 1]] = expression
             else:
                 lines.append((name, expression))
-                if name.startswith("K_"):
-                    stage_rates[name[2 : -len(tag) - 1]] = symbol(name)
+                if name.startswith("RATE_"):
+                    stage_rates[name[len("RATE_") : -len(tag) - 1]] = symbol(name)
         rates.append(stage_rates)
     k1, k2, k3, k4 = rates
     sixth = h / 6
     return lines + [
-        (f"{name}_E", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name])) for name in variables
+        (f"{name}_END", symbol(name) + sixth * (k1[name] + 2 * k2[name] + 2 * k3[name] + k4[name]))
+        for name in variables
     ]
 
 
@@ -262,19 +263,19 @@ def input_at_stages(degree: int, substeps: int) -> Assignments:
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
         value: sp.Expr = symbol(f"U_{degree}")
         if degree:
-            lines.append((f"T_{tag}", symbol("T") + fraction * h))
+            lines.append((f"TAU_{tag}", symbol("TAU") + fraction * h))
         for k in range(degree - 1, -1, -1):
-            value = symbol(f"U_{k}") + symbol(f"T_{tag}") * value
-        lines.append((f"V_{tag}", value))
+            value = symbol(f"U_{k}") + symbol(f"TAU_{tag}") * value
+        lines.append((f"U_AT_{tag}", value))
     return lines
 
 
 def state_rk4_step(model: Model, degree: int) -> Assignments:
     """One Runge-Kutta step of the state alone."""
     at = {symbol(i): symbol(f"M_{i}") for i in model.states}
-    rates = {f"K_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
+    rates = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     stages = runge_kutta_4(
-        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "W"), model.substeps
+        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model.substeps
     )
     return input_at_stages(degree, model.substeps) + stages
 
@@ -293,7 +294,7 @@ def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tup
     if model.is_continuous:
         mapping = {**row_of, **{f"M_{x}": row_of[x] for x in model.states}}
         lines = substitute(state_rk4_step(model, degree), mapping)
-        return lines, {row_of[x]: f"M_{x}_E" for x in model.states}
+        return lines, {row_of[x]: f"M_{x}_END" for x in model.states}
     lines, propagation = propagate_difference_equation(model)
     results = {}
     for x, value in zip(model.states, propagation.state, strict=True):
@@ -331,12 +332,12 @@ def reverse_mode_derivative(
         parts = adjoints.pop(name, None)
         if parts is None:
             continue
-        adjoint = symbol(f"G_{name}")
+        adjoint = symbol(f"ADJ_{name}")
         lines.append((str(adjoint), sum(parts, sp.S.Zero)))
         inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
         for used in sorted(expression.free_symbols, key=str):
             # The slope of 1/x is -(1/x)², without another division.
             slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
             adjoints.setdefault(str(used), []).append(slope * adjoint)
-    lines += [(f"G_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]
+    lines += [(f"ADJ_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]
     return lines

@@ -71,20 +71,20 @@ def print_integrator(
     if not model.is_continuous:
         return ""
     start = {name: printer_numba.print_expression(value) for name, value in symbolic.integrator_start(model).items()}
-    stepped = {name: f"{name}_E" for name in integrator_rows(model)}
+    stepped = {name: f"{name}_END" for name in integrator_rows(model)}
     step = symbolic.substitute(variational_rk4_step(model, degree, sample_length), input_values or {})
     source = printer_numba.print_lane_loop(
         "begin", [], start, layout, lanes, doc="The integrator at the start of a sample."
     )
     doc = "One Runge-Kutta step, from T in [0, 1) of the sample on."
-    return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("T",), doc)
+    return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("TAU",), doc)
 
 
 def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.S.One) -> Assignments:
     """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_E``."""
     states, h = list(model.states), sample_length * sp.Rational(1, model.substeps)
     stage, slopes = _stage_rates_and_slopes(model)
-    plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("N", states))
+    plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
     lines = Program(
         input_at_stages(degree, model.substeps) + runge_kutta_4(plain_variables, stage, model.substeps, sample_length)
     )
@@ -96,20 +96,20 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
         for i in states:
             for k in states:
                 value = (counts * h if i == k else sp.S.Zero) + reach * h * stage_slopes.get((i, k), sp.S.Zero)
-                weight[i, k] = lines.assign(f"H_{i}_{k}_{tag}", value)
+                weight[i, k] = lines.assign(f"END_BY_RATE_{i}_{k}_{tag}", value)
         assigned = {name for name, _ in stage}
         for i, j in slopes:
             at = [symbol(f"J_{k}_{j}_{tag}") if f"J_{k}_{j}" in assigned else slopes[k, j] for k in states]
             product = sum((weight[i, k] * slope for k, slope in zip(states, at, strict=True)), sp.S.Zero)
-            stage_slopes[i, j] = lines.assign(f"HJ_{i}_{j}_{tag}", product) if j in states else product
+            stage_slopes[i, j] = lines.assign(f"END_BY_STATE_{i}_{j}_{tag}", product) if j in states else product
             total[i, j] += stage_slopes[i, j]
     for i in states:
         for k in states:
-            total[i, k] = lines.assign(f"WHOLE_{i}_{k}", total[i, k] + (1 if i == k else 0))
+            total[i, k] = lines.assign(f"F_STEP_{i}_{k}", total[i, k] + (1 if i == k else 0))
     for i, j in slopes:
-        columns = {k: symbol(f"D_{k}" if j == _HELD_NOISE else f"S_{k}_{j}") for k in states}
+        columns = {k: symbol(f"NOISE_INPUT_{k}" if j == _HELD_NOISE else f"F_{k}_{j}") for k in states}
         column = sum((total[i, k] * columns[k] for k in states), sp.S.Zero)
-        lines.append((f"{columns[i]}_E", column if j in states else column + total[i, j]))
+        lines.append((f"{columns[i]}_END", column if j in states else column + total[i, j]))
     return lines
 
 
@@ -121,7 +121,7 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     c, states = differentiate(model), list(model.states)
     at = {symbol(i): symbol(f"M_{i}") for i in states}
     n = len(states)
-    named = {f"K_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
+    named = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
     jacobian = [[slope.xreplace(at) for slope in row] for row in c.jacobian]
     noise = [e.xreplace(at) for e in c.noise]
     slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.dynamic_names) for a, i in enumerate(states)}
@@ -132,12 +132,12 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     for a in range(n):
         for b in range(a, 0 if model.held else n):
             noise_rate = sum(
-                jacobian[a][k] * symmetric_entry("N", states[k], states[b], states)
-                + jacobian[b][k] * symmetric_entry("N", states[k], states[a], states)
+                jacobian[a][k] * symmetric_entry("Q", states[k], states[b], states)
+                + jacobian[b][k] * symmetric_entry("Q", states[k], states[a], states)
                 for k in range(n)
             )
-            named[f"K_N_{states[a]}_{states[b]}"] = noise_rate + noise[a] * noise[b]
-    return eliminate_common_subexpressions(named, "W"), slopes
+            named[f"RATE_Q_{states[a]}_{states[b]}"] = noise_rate + noise[a] * noise[b]
+    return eliminate_common_subexpressions(named, "CSE"), slopes
 
 
 def coarse_trajectory(model: Model, degree: int) -> tuple[Assignments, dict[str, str]]:
@@ -152,8 +152,8 @@ def coarse_trajectory(model: Model, degree: int) -> tuple[Assignments, dict[str,
     for s in range(steps):
         step_names = {name: f"{name}_{s}" for name, _ in step}
         begin = {f"M_{i}": name for i, name in trajectory[-1].items()}
-        lines += symbolic.substitute(step, {**step_names, **begin, "T": sp.Rational(s, steps)})
-        trajectory.append({i: step_names[f"M_{i}_E"] for i in model.states})
+        lines += symbolic.substitute(step, {**step_names, **begin, "TAU": sp.Rational(s, steps)})
+        trajectory.append({i: step_names[f"M_{i}_END"] for i in model.states})
     middle = {f"MIDDLE_{i}": name for i, name in trajectory[steps // 2].items()}
     return lines, middle | {f"END_{i}": name for i, name in trajectory[-1].items()}
 
@@ -167,11 +167,11 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
         N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
     states = list(model.states)
-    lines = Program(symbolic.substitute(input_at_stages(degree, 1), {"T": sp.S.Zero}))
+    lines = Program(symbolic.substitute(input_at_stages(degree, 1), {"TAU": sp.S.Zero}))
     points = {tag: {i: symbol(f"{at}{i}") for i in states} for tag, at in (("A", ""), ("B", "MIDDLE_"), ("D", "END_"))}
     end = {symbol(i): value for i, value in points["D"].items()}
     noise = [g.xreplace(end) for g in differentiate(model).noise]
-    slopes = {tag: _slopes_at(model, tag, point, symbol(f"V_{tag}"), lines) for tag, point in points.items()}
+    slopes = {tag: _slopes_at(model, tag, point, symbol(f"U_AT_{tag}"), lines) for tag, point in points.items()}
     slopes["C"] = slopes["B"]
     stage_slopes: _Slopes = {}
     total: _Slopes = dict.fromkeys(slopes["A"], sp.S.Zero)
@@ -182,17 +182,17 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
         for i in states:
             for k in states:
                 value = (counts if i == k else 0) + reach * stage_slopes.get((i, k), sp.S.Zero)
-                H[i, k] = lines.assign(f"H_{i}_{k}_{tag}", value)
+                H[i, k] = lines.assign(f"END_BY_RATE_{i}_{k}_{tag}", value)
         for i, j in total:
             product = sum((H[i, k] * slopes[tag][k, j] for k in states), sp.S.Zero)
-            stage_slopes[i, j] = lines.assign(f"HJ_{i}_{j}_{tag}", product) if j in states else product
+            stage_slopes[i, j] = lines.assign(f"END_BY_STATE_{i}_{j}_{tag}", product) if j in states else product
             total[i, j] += stage_slopes[i, j]
         noise_slopes[tag] = [sum((H[i, k] * g for k, g in zip(states, noise, strict=True)), sp.S.Zero) for i in states]
-    jacobian = {(i, j): lines.assign(f"S_{i}_{j}", total[i, j] + (1 if i == j else 0)) for i, j in total}
+    jacobian = {(i, j): lines.assign(f"F_{i}_{j}", total[i, j] + (1 if i == j else 0)) for i, j in total}
     noise_slopes["B"] = [b + c for b, c in zip(noise_slopes["B"], noise_slopes["C"], strict=True)]
     simpson_weights = {"A": sp.Integer(6), "B": sp.Rational(3, 2), "D": sp.Integer(6)}
     noise_slopes = {
-        tag: [lines.assign(f"KICK_{i}_{tag}", k) for i, k in zip(states, noise_slopes[tag], strict=True)]
+        tag: [lines.assign(f"NOISE_EFFECT_{i}_{tag}", k) for i, k in zip(states, noise_slopes[tag], strict=True)]
         for tag in simpson_weights
     }
     noise_cov = {}
@@ -203,7 +203,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
                 sp.S.Zero,
             )
             noise_cov[i, k] = noise_cov[k, i] = lines.assign(
-                f"N_{i}_{k}", jacobian[i, _HELD_NOISE] * jacobian[k, _HELD_NOISE] if model.held else value
+                f"Q_{i}_{k}", jacobian[i, _HELD_NOISE] * jacobian[k, _HELD_NOISE] if model.held else value
             )
     return lines, symbolic.Propagation(
         tuple(points["D"].values()),
@@ -215,7 +215,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
 def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], u: sp.Expr, lines: Program) -> _Slopes:
     """Jacobian of the rates at a state and an input; common subexpressions are assigned to ``lines``, with a tag."""
     stage, slopes = _stage_rates_and_slopes(model)
-    stage = [(name, value) for name, value in stage if not name.startswith("K_")]
+    stage = [(name, value) for name, value in stage if not name.startswith("RATE_")]
     tagged = {name: f"{name}_{tag}" for name, _ in stage}
     values_at = {f"M_{i}": value for i, value in point.items()} | {"u": u}
     lines += symbolic.substitute(stage, {**tagged, **values_at})

@@ -70,7 +70,7 @@ def compile_structured_loop(
     layout, update = belief_update.layout, belief_update.update
     energies_of = compile_free_energies(model, iterations, lanes, layout)
     variant = f"{model.name}_{variant_digest(model.digest, degree, iterations, lanes, expectations)}"
-    unsound = layout.get("UNSOUND", -1) * lanes
+    unsound = layout.get("INDEFINITE_COUNT", -1) * lanes
 
     @jit_closure(variant)
     def update_block(W, before):

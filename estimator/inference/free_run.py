@@ -77,25 +77,25 @@ def output_at(model: Model, coefficients: FloatArray, state: FloatArray, u: floa
 @cache
 def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
     """Compile ``run(starts, u, y)`` and ``output_of(start, u)``; a start holds states and coefficients."""
-    layout = number_rows(*model.names, *input_rows(model, degree), "SHOWN")
+    layout = number_rows(*model.names, *input_rows(model, degree), "Y_PRED")
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic
 
         lines, results = symbolic.propagate_state(model, degree, {name: name for name in model.names})
-        uniform = ("T",) if model.is_continuous else ()
+        uniform = ("TAU",) if model.is_continuous else ()
         source = printer_numba.print_lane_loop(
             "move", lines, results, layout, 1, uniform, doc="One sample, or one Runge-Kutta step, of the state."
         )
         end = symbolic.input_at_end(model, degree)
         shown = symbolic.substitute([("", symbolic.differentiate(model).outputs[0])], {"u": end})[0][1]
         return source + printer_numba.print_lane_loop(
-            "sense", [("S", shown)], {"SHOWN": "S"}, layout, 1, doc="The output."
+            "sense", [("OUTPUT", shown)], {"Y_PRED": "OUTPUT"}, layout, 1, doc="The output."
         )
 
     code = load_generated(model.name, "free-run", repr((model.digest, degree)), make, RUNTIME_FUNCTIONS)
     move, sense, size, steps, n = code.move, code.sense, len(layout), model.substeps, len(model.names)
-    shown, continuous = layout["SHOWN"], model.is_continuous
+    shown, continuous = layout["Y_PRED"], model.is_continuous
     feed = compile_input_writer(model, degree, [layout[row] for row in input_rows(model, degree)], 1)
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}")

@@ -211,14 +211,14 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
         n_outputs=model.n_outputs,
         n_totals=len(likelihood_rows(model)),
         coefficient=rows[next(iter(model.coefficients))],
-        noise=rows["Q"],
+        noise=rows["PROCESS_VARIANCE"],
         input=rows["U_0"],
-        sample_length=rows["SPAN"] if variable_step else -1,
-        is_counted=rows["LIVE"],
+        sample_length=rows["SAMPLE_LENGTH"] if variable_step else -1,
+        is_counted=rows["IS_COUNTED"],
         first_total=rows["LOSS"],
         output=rows[f"Y_{sensor}"] if follows_outputs else -1,
-        predicted_output=rows[f"SHOWN_{sensor}"] if follows_outputs else -1,
-        predicted_variance=rows[f"SPREAD_{sensor}"] if follows_outputs else -1,
+        predicted_output=rows[f"Y_PRED_{sensor}"] if follows_outputs else -1,
+        predicted_variance=rows[f"HPH_{sensor}"] if follows_outputs else -1,
     )
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}_{int(follows_outputs)}_{int(variable_step)}")

@@ -123,7 +123,7 @@ def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
         slopes = [e.diff(known[name]) for e in expressions for name in names]
         source = ""
         for title, values in (("values", expressions), ("slopes", slopes)):
-            lines = symbolic.eliminate_common_subexpressions({f"V_{i}": e for i, e in enumerate(values)}, "W")
+            lines = symbolic.eliminate_common_subexpressions({f"V_{i}": e for i, e in enumerate(values)}, "CSE")
             body = "".join(f"    {name} = {printer_numba.print_expression(e)}\n" for name, e in lines)
             gathered = ", ".join(f"V_{i}" for i in range(len(values)))
             source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"

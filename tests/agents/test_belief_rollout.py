@@ -171,7 +171,7 @@ def test_imagination_is_the_plain_recursion(case, walks):
     for j in range(0, LANES, 11):
         mean, cov, surprise = expected(case, belief, u[:, j], 0.1, walk)
         if not walks and model.n_outputs == 1:
-            assert W[place["SURPRISE"], j] == pytest.approx(surprise, rel=1e-9)
+            assert W[place["PENDING_VARIANCE"], j] == pytest.approx(surprise, rel=1e-9)
         np.testing.assert_allclose(W[:n, j], mean[:n], rtol=1e-9)
         upper = np.triu_indices(n + k)
         got = np.empty_like(cov)
@@ -194,8 +194,8 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
     )
     W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
     place = compile_expected_update(model, degree).layout
-    shown, variance = W[place["SHOWN"], 0], W[place["SPREAD"], 0]
-    assert W[place["SURPRISE"], 0] == 0.0  # the output before the first sample has been seen
+    shown, variance = W[place["Y_PRED"], 0], W[place["S_PRED"], 0]
+    assert W[place["PENDING_VARIANCE"], 0] == 0.0  # the output before the first sample has been seen
     # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
     deviation = np.sqrt(variance + 5.0 * 0.01**2)
     within = abs(shown) + min(2.0 * deviation, 0.5 * limit) - limit
@@ -215,7 +215,7 @@ def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach
     u = np.stack([np.full(LANES, 0.1), np.linspace(-0.15, 0.15, LANES)])
     W, _ = block_after(model, 0, belief, u, told)
     place = compile_expected_update(model, 0).layout
-    shown, alone, surprise = (W[place[row]] for row in ("SHOWN", "SPREAD", "SURPRISE"))
+    shown, alone, surprise = (W[place[row]] for row in ("Y_PRED", "S_PRED", "PENDING_VARIANCE"))
     assert (surprise > 0).all()
     # The input that brakes hardest is -0.15 where the sensor shows more than 0 and rises with the input.
     hardest = np.where(shown > 0, -0.15, 0.15) * (-1 if reach < 0 else 1)

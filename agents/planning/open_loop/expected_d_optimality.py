@@ -134,12 +134,12 @@ def _layout(model: Model, degree: int) -> _Layout:
     k = model.n_coefficients
     rows, columns = np.array(list(combinations_with_replacement(range(k), 2))).T.copy()
     return _Layout(
-        F=at[f"F_{first}_{first}"],
+        F=at[f"INFORMATION_{first}_{first}"],
         C=at[first],
         U=at["U_0"],
-        Q=at["Q"],
-        SHOWN=at[f"SHOWN_{next(iter(model.outputs))}"],
-        LIVE=at["LIVE"],
+        Q=at["PROCESS_VARIANCE"],
+        SHOWN=at[f"Y_PRED_{next(iter(model.outputs))}"],
+        LIVE=at["IS_COUNTED"],
         size=len(lane_paths.layout) * LANES,
         n_tape=lane_paths.n_tape,
         n_path=len(filter_state_rows(model)),

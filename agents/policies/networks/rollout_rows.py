@@ -57,7 +57,7 @@ def rollout_rows(view: ModelView) -> RolloutRows:
         older=row["OLDER_INPUT"],
         now=row["NOW"],
         velocity=row["VELOCITY"] if velocity_state < 0 else row[rate],
-        signal=row["SHOWN"],
+        signal=row["Y_PRED"],
         phi=row[f"PHI_{next(iter(model.coefficients))}"],
         velocity_state=velocity_state,
         pairs=tuple(combinations(range(model.n_coefficients), 2)),
