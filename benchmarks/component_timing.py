@@ -104,7 +104,7 @@ def plants(num_envs: int, factorisation: str = "structured") -> npt.NDArray[np.f
     truth |= dict.fromkeys(noise_std_rows(experiment.plant).values(), NOISE)
     for name, value in truth.items():
         blocks[:, place[name]] = value
-    first = place["STREAM_a"]
+    first = place["SFC64_a"]
     rng = np.random.default_rng(0)
     words = np.stack([new_stream_words(rng) for _ in range(LANES)], axis=-1)
     # Copies of a few streams do: nothing here depends on their independence.

@@ -106,7 +106,7 @@ class Batch:
     def seed(self, index: int, generator: np.random.Generator) -> None:
         """Start environment ``index``'s stream of random numbers from its ``np_random``."""
         block, lane = divmod(index, LANES)
-        first = self._row_of["STREAM_a"]
+        first = self._row_of["SFC64_a"]
         self._blocks[block, first : first + 4, lane] = new_stream_words(generator, self.experiment.branch)
 
     def reset(self, mask: npt.NDArray[np.bool_]) -> None:
@@ -163,7 +163,7 @@ class Batch:
         NaN in ``truth`` keeps the drawn numbers: of a whole row, or of its standard deviations.
         """
         params, n = self._params, len(parameter_names(self.experiment.truth_model))
-        kept_rows = [place for name, place in self._row_of.items() if name.startswith(("STREAM_", "JUMP_"))]
+        kept_rows = [place for name, place in self._row_of.items() if name.startswith(("SFC64_", "JUMP_"))]
         noise_rows_kept = [self._row_of[row] for row in noise_std_rows(self.experiment.truth_model).values()]
         for row in np.flatnonzero(mask & np.isfinite(truth[:, 0])).tolist():
             b, lane = divmod(row, LANES)

@@ -121,7 +121,7 @@ class CustomFunctions:
 
     def before_step(self) -> None:
         """Remember the beliefs before a step."""
-        self._needed_reset = self._batch.row_values("WAITING") != 0.0
+        self._needed_reset = self._batch.row_values("NEEDS_RESET") != 0.0
         if callable(self._reward):
             self._records_before = self._batch.records()
 

@@ -88,7 +88,11 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
     row_of, offset_of, generated = block_layout(spec), block_offsets(spec), generated_functions(spec)
     n_rows, n_saved = max(row_of.values()) + 1, len(belief_rows(spec.belief_model)) * LANES
     n_observation, n_outcome = len(observation_bounds(spec.belief_model)), len(OUTCOME_ROWS)
-    elapsed, needs_reset, first_outcome = offset_of["ELAPSED"], offset_of["WAITING"], offset_of[OUTCOME_ROWS[0]]
+    elapsed, needs_reset, first_outcome = (
+        offset_of["ELAPSED_SAMPLES"],
+        offset_of["NEEDS_RESET"],
+        offset_of[OUTCOME_ROWS[0]],
+    )
     terminated, truncated = offset_of["TERMINATED"], offset_of["TRUNCATED"]
     jump_at, jump_factor = offset_of["JUMP_AT"], offset_of["JUMP_FACTOR"]
     first_parameter = offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
@@ -103,7 +107,7 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
     reset_filter_bank, update_filter_bank = compile_filter_bank(spec) if has_noise_hypotheses else NO_FILTER_BANK
     finish_step, observe = generated.finish_step, generated.observe
     paid_by = "terminal has_terminated_return terminated_return"
-    pay_reward = lanewise(row_of, "REWARD EARNED", uniform=paid_by)(plant_stages.pay_reward)
+    pay_reward = lanewise(row_of, "REWARD EPISODE_RETURN", uniform=paid_by)(plant_stages.pay_reward)
     restore_broken_beliefs = sample_stages.compile_belief_restoration(spec)
     save_sample, add_sample = sample_stages.compile_hold(spec)
     update_truth = sample_stages.compile_truth_update(spec, generated, hooks)

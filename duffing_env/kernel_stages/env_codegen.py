@@ -144,13 +144,13 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
             results[f"TRUE_{c}"] = f"V_{c}"
         lines += symbolic.eliminate_common_subexpressions(coefficient_values, tag)
     for p in estimated_expressions(spec.belief_model):
-        lines.append((f"V_PER_{p}", 1 / symbolic.symbol(f"PARAM_{p}")))
-        results[f"PER_{p}"] = f"V_PER_{p}"
+        lines.append((f"V_INVERSE_TRUE_{p}", 1 / symbolic.symbol(f"PARAM_{p}")))
+        results[f"INVERSE_TRUE_{p}"] = f"V_INVERSE_TRUE_{p}"
     return loop("set_true_coefficients", "The true coefficients, of the parameters.", lines, results, "step", one=True)
 
 
 def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
-    """Assignments of ``NEW_LOG_DET``, ``NEW_LOG_DENSITY`` at the truth and ``NEW_ERROR``; and their validity."""
+    """Assign ``NEW_LOG_DET``, and ``NEW_LOG_DENSITY`` and ``NEW_PARAMETER_ERROR`` at the truth; and their validity."""
     import sympy as sp
 
     from estimator.engine import symbolic
@@ -163,11 +163,11 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     coefficient_symbols = {c: symbol(c) for c in model.coefficients} | {"step": symbol("step")}
     capped_error_symbol = sp.Function("capped_error")
     ratios = {
-        f"RATIO_{p}": symbolic.parse_expression(text, coefficient_symbols, model.name) * symbol(f"PER_{p}")
+        f"RATIO_{p}": symbolic.parse_expression(text, coefficient_symbols, model.name) * symbol(f"INVERSE_TRUE_{p}")
         for p, text in estimated_expressions(model).items()
     }
     lines += symbolic.eliminate_common_subexpressions(ratios, "RW")
-    lines.append(("NEW_ERROR", sum(capped_error_symbol(symbol(r)) for r in ratios) / len(ratios)))
+    lines.append(("NEW_PARAMETER_ERROR", sum(capped_error_symbol(symbol(r)) for r in ratios) / len(ratios)))
     return lines, is_sound
 
 
@@ -179,14 +179,15 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
 
     model = spec.belief_model
     lines, is_sound = _belief_beside_truth(spec)
-    result_rows = {name: f"NEW_{name}" for name in ("LOG_DET", "LOG_DENSITY", "ERROR")}
+    result_rows = {name: f"NEW_{name}" for name in ("LOG_DET", "LOG_DENSITY", "PARAMETER_ERROR")}
     source = loop("evaluate_belief", "Compare lane j's belief with its truth.", lines, result_rows, "step", one=True)
     select, is_positive, is_finite = (sp.Function(name) for name in ("select", "positive", "finite"))
     variances = {f"P_{name}_{name}" for name in model.names}
     checked_rows = [name for name in belief_rows(model) if not name.startswith("P_") or name in variances]
     checked_rows += [f"X_{x}" for x in spec.truth_model.states] + [f"Y_{y}" for y in model.outputs]
     total = sum(
-        (symbol(name) for name in checked_rows), symbol("NEW_LOG_DENSITY") + symbol("NEW_ERROR") + symbol("WORK")
+        (symbol(name) for name in checked_rows),
+        symbol("NEW_LOG_DENSITY") + symbol("NEW_PARAMETER_ERROR") + symbol("HOOK_REWARD"),
     )
     spreads = [symbol(f"P_{x}_{x}") for x in model.states] if spec.factorisation == "structured" else []
     lines.append(("TOTAL", total))
@@ -194,13 +195,18 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     is_valid *= sp.Mul(*(is_positive(symbol(name)) for name in belief_rows(model)[-2 - 2 * model.n_outputs :]))
     is_off_record = symbol("OFF_RECORD")
     lines += [("SOUND", is_valid), ("BROKEN", 1 - symbol("SOUND")), ("VOID", symbol("BROKEN") + is_off_record)]
-    for name in ("LOG_DET", "LOG_DENSITY", "ERROR"):
+    for name in ("LOG_DET", "LOG_DENSITY", "PARAMETER_ERROR"):
         lines.append((f"E_{name}", select(symbol("VOID"), symbol(name), symbol(f"NEW_{name}"))))
-    lines.append(("E_WORK", select(symbol("VOID"), sp.S.Zero, symbol("WORK"))))
+    lines.append(("E_HOOK_REWARD", select(symbol("VOID"), sp.S.Zero, symbol("HOOK_REWARD"))))
     lines.append(("GAIN", (symbol("LOG_DET") - symbol("E_LOG_DET")) / 2))
     lines.append(("POSTERIOR", symbol("E_LOG_DENSITY") - symbol("LOG_DENSITY")))
     weight_names = ("information_weight", "posterior_weight", "error_weight", "hook_weight")
-    reward_terms = (symbol("GAIN"), symbol("POSTERIOR"), symbol("ERROR") - symbol("E_ERROR"), symbol("E_WORK"))
+    reward_terms = (
+        symbol("GAIN"),
+        symbol("POSTERIOR"),
+        symbol("PARAMETER_ERROR") - symbol("E_PARAMETER_ERROR"),
+        symbol("E_HOOK_REWARD"),
+    )
     reward = sum(symbol(weight) * value for weight, value in zip(weight_names, reward_terms, strict=True))
     # In two lines: SymPy would square the factors, and the square of the input alone may overflow.
     lines.append(("EFFORT", symbol("sqrt_input_cost") * symbol("INPUT")))
@@ -210,11 +216,16 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
         sp.Abs(symbol(f"Y_{first_sensor}")) - symbol("max_output")
     )
     is_at_horizon = sp.Function("reaches")(symbol("LATER"), symbol("horizon"))
-    lines += [("PAID", reward), ("STOPPED", is_positive(is_beyond_limit)), ("LATER", symbol("ELAPSED") + 1)]
+    lines += [("PAID", reward), ("STOPPED", is_positive(is_beyond_limit)), ("LATER", symbol("ELAPSED_SAMPLES") + 1)]
     lines.append(("OVER", (1 - symbol("STOPPED")) * is_at_horizon))
-    results = {"LOG_DET": "E_LOG_DET", "LOG_DENSITY": "E_LOG_DENSITY", "ERROR": "E_ERROR", "REWARD": "PAID"}
+    results = {
+        "LOG_DET": "E_LOG_DET",
+        "LOG_DENSITY": "E_LOG_DENSITY",
+        "PARAMETER_ERROR": "E_PARAMETER_ERROR",
+        "REWARD": "PAID",
+    }
     results |= {"INFORMATION_GAIN": "GAIN", "LOG_POSTERIOR_GAIN": "POSTERIOR", "TERMINATED": "STOPPED"}
-    results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED": "LATER"}
+    results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED_SAMPLES": "LATER"}
     uniform = ("step", "max_output", "horizon", "sqrt_input_cost", *weight_names)
     doc = "The reward of a sample, and whether it ends the episode; a broken belief pays nothing and ends it."
     return source + loop("finish_step", doc, lines, results, *uniform)
@@ -247,8 +258,8 @@ def _observation_source(spec: KernelSpec) -> str:
     for y in model.outputs:
         entries[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
     # One division serves all lanes where a number does not differ between them; both entries end at exactly 0.
-    entries["time_left"] = (symbol("horizon") - symbol("ELAPSED")) * symbol("per_horizon")
-    entries["budget_left"] = 1 - symbol("SPENT") / symbol("budget")
+    entries["time_left"] = (symbol("horizon") - symbol("ELAPSED_SAMPLES")) * symbol("per_horizon")
+    entries["budget_left"] = 1 - symbol("ENERGY_SPENT") / symbol("budget")
     clip = sp.Function("clip")
     bounds = observation_bounds(model)
     for name, value in entries.items():

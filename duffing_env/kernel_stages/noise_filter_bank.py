@@ -68,7 +68,7 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         (max(member_rows.values()) + 1) * LANES,
         row_of.get("FREE_ENERGY", -1) * LANES,
     )
-    unsound_row, needs_reset = member_rows.get("INDEFINITE_COUNT", -1) * LANES, row_of["WAITING"] * LANES
+    unsound_row, needs_reset = member_rows.get("INDEFINITE_COUNT", -1) * LANES, row_of["NEEDS_RESET"] * LANES
     free_energies_of = compile_free_energies(model, spec.iterations, LANES, member_rows, every_iteration=False)
     compile_inner = jit_closure(spec.name)
 

@@ -16,59 +16,59 @@ from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 _FLOAT32_ROUNDING = 2.0**-22
 
 
-def draw_noise(STREAM_a, STREAM_b, STREAM_c, STREAM_d, WAITING):
+def draw_noise(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
     """Draw two standard normal numbers; the stream of an environment that waits for its reset stands still."""
     first, a, b, c, d = sfc64_next(
-        float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
+        float_to_word(SFC64_a), float_to_word(SFC64_b), float_to_word(SFC64_c), float_to_word(SFC64_d)
     )
     second, a, b, c, d = sfc64_next(a, b, c, d)
     w, v = box_muller(to_uniform(first), to_uniform(second))
-    live = WAITING == 0.0
+    live = NEEDS_RESET == 0.0
     return (
-        word_to_float(a) if live else STREAM_a, word_to_float(b) if live else STREAM_b,
-        word_to_float(c) if live else STREAM_c, word_to_float(d) if live else STREAM_d, w, v,
+        word_to_float(a) if live else SFC64_a, word_to_float(b) if live else SFC64_b,
+        word_to_float(c) if live else SFC64_c, word_to_float(d) if live else SFC64_d, w, v,
     )  # fmt: skip
 
 
 def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
     """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
-    return lanewise(row_of, "STREAM_a STREAM_b STREAM_c STREAM_d NOISE_w NOISE_v")(draw_noise)
+    return lanewise(row_of, "SFC64_a SFC64_b SFC64_c SFC64_d NOISE_w NOISE_v")(draw_noise)
 
 
-def limit_input(ASKED, INPUT, LAST_INPUT, SPENT, budget, max_slew):
+def limit_input(REQUESTED_INPUT, INPUT, LAST_INPUT, ENERGY_SPENT, budget, max_slew):
     """The requested input, cut to the largest change from the last input and to the rest of the energy budget.
 
-    ``SPENT`` is the energy Σ u² so far; the rest of the budget bounds the next input, so it cannot be exceeded.
+    ``ENERGY_SPENT`` is the energy Σ u² so far; the rest of the budget bounds the next input, so it cannot be exceeded.
     """
-    applied_input = min(max(ASKED, INPUT - max_slew), INPUT + max_slew)
-    max_affordable = np.sqrt(max(budget - SPENT, 0.0))
+    applied_input = min(max(REQUESTED_INPUT, INPUT - max_slew), INPUT + max_slew)
+    max_affordable = np.sqrt(max(budget - ENERGY_SPENT, 0.0))
     applied_input = min(max(applied_input, -max_affordable), max_affordable)
-    return applied_input, INPUT, LAST_INPUT, applied_input - INPUT, SPENT + applied_input * applied_input
+    return applied_input, INPUT, LAST_INPUT, applied_input - INPUT, ENERGY_SPENT + applied_input * applied_input
 
 
-def replay_sample(INPUT, RECORDED_u, RECORDED_y, max_input):
+def replay_sample(INPUT, REPLAYED_u, REPLAYED_y, max_input):
     """The recorded input and output, and whether the action deviates from the recorded input."""
-    deviates = abs(INPUT - RECORDED_u) > _FLOAT32_ROUNDING * max_input
-    return RECORDED_u, RECORDED_y, 1.0 if deviates else 0.0
+    deviates = abs(INPUT - REPLAYED_u) > _FLOAT32_ROUNDING * max_input
+    return REPLAYED_u, REPLAYED_y, 1.0 if deviates else 0.0
 
 
-def pay_reward(REWARD, EARNED, TERMINATED, TRUNCATED, terminal, has_terminated_return, terminated_return):
+def pay_reward(REWARD, EPISODE_RETURN, TERMINATED, TRUNCATED, terminal, has_terminated_return, terminated_return):
     """Pay the reward now or at the end of the episode, and correct the return of a terminated episode.
 
-    ``EARNED`` is the sum of the episode's rewards so far, as if every sample were paid.
+    ``EPISODE_RETURN`` is the sum of the episode's rewards so far, as if every sample were paid.
     """
-    already_paid = 0.0 if terminal else EARNED
-    EARNED += REWARD
-    episode_return = EARNED if TERMINATED + TRUNCATED != 0.0 else 0.0
+    already_paid = 0.0 if terminal else EPISODE_RETURN
+    EPISODE_RETURN += REWARD
+    episode_return = EPISODE_RETURN if TERMINATED + TRUNCATED != 0.0 else 0.0
     REWARD = episode_return if terminal else REWARD
-    return terminated_return - already_paid if has_terminated_return and TERMINATED != 0.0 else REWARD, EARNED
+    return terminated_return - already_paid if has_terminated_return and TERMINATED != 0.0 else REWARD, EPISODE_RETURN
 
 
-def draw_parameter_jump(STREAM_a, STREAM_b, STREAM_c, STREAM_d, jump, horizon):
+def draw_parameter_jump(SFC64_a, SFC64_b, SFC64_c, SFC64_d, jump, horizon):
     """Draw the sample of the first parameter's jump, in the middle half of the episode, and its log-uniform factor."""
     low = math.log(1.0 - jump)
     first, a, b, c, d = sfc64_next(
-        float_to_word(STREAM_a), float_to_word(STREAM_b), float_to_word(STREAM_c), float_to_word(STREAM_d)
+        float_to_word(SFC64_a), float_to_word(SFC64_b), float_to_word(SFC64_c), float_to_word(SFC64_d)
     )
     second, a, b, c, d = sfc64_next(a, b, c, d)
     jump_sample = math.floor(horizon * (0.25 + 0.5 * to_uniform(first)))

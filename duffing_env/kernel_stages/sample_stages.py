@@ -47,14 +47,23 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
     Its plant is drawn and put at rest, and its belief put to the prior.
     """
     offset_of, n_record = block_offsets(spec), len(belief_rows(spec.belief_model))
-    first_stream, first_parameter = offset_of["STREAM_a"], offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
+    first_stream, first_parameter = offset_of["SFC64_a"], offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
     jump_at, has_noise_hypotheses = offset_of["JUMP_AT"], spec.has_noise_hypotheses
-    zeroed_names = ["INPUT", "LAST_INPUT", "OLDER_INPUT", "SPENT", "EARNED", "ELAPSED", "WAITING", "WORK"]
+    zeroed_names = [
+        "INPUT",
+        "LAST_INPUT",
+        "OLDER_INPUT",
+        "ENERGY_SPENT",
+        "EPISODE_RETURN",
+        "ELAPSED_SAMPLES",
+        "NEEDS_RESET",
+        "HOOK_REWARD",
+    ]
     # Mean field's rows of a θ2 that the model does not have must be 0, also after an episode that ended with NaN.
     zeroed_names += missing_mean_field_rows(spec)
     zeroed_names += [f"Y_{y}" for y in spec.truth_model.outputs] + [f"X_{x}" for x in spec.truth_model.states]
     zeroed_rows = tuple(offset_of[name] for name in zeroed_names)
-    jump_rows = "STREAM_a STREAM_b STREAM_c STREAM_d JUMP_AT JUMP_FACTOR"
+    jump_rows = "SFC64_a SFC64_b SFC64_c SFC64_d JUMP_AT JUMP_FACTOR"
     draw_parameter_jump = lanewise(block_layout(spec), jump_rows, uniform="jump horizon", single_lane=True)(
         plant_stages.draw_parameter_jump
     )
@@ -79,7 +88,10 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
 
 def compile_input(spec: KernelSpec) -> Any:
     """``apply_input(W, actions, lane, max_input, budget, max_slew)``: the actions of a block as limited inputs."""
-    requested_input, limited_rows = block_offsets(spec)["ASKED"], "INPUT LAST_INPUT OLDER_INPUT RISE SPENT"
+    requested_input, limited_rows = (
+        block_offsets(spec)["REQUESTED_INPUT"],
+        "INPUT LAST_INPUT OLDER_INPUT RISE ENERGY_SPENT",
+    )
     limit_input = lanewise(block_layout(spec), limited_rows, uniform="budget max_slew")(plant_stages.limit_input)
 
     @jit_closure(spec.name)
@@ -94,7 +106,11 @@ def compile_input(spec: KernelSpec) -> Any:
 def compile_replay(spec: KernelSpec) -> Any:
     """``replay_sample(W, recorded, input_delay, max_input)``: a sample of the record in place of a plant."""
     offset_of, first_sensor = block_offsets(spec), next(iter(spec.truth_model.outputs))
-    recorded_u_row, recorded_y_row, elapsed = offset_of["RECORDED_u"], offset_of["RECORDED_y"], offset_of["ELAPSED"]
+    recorded_u_row, recorded_y_row, elapsed = (
+        offset_of["REPLAYED_u"],
+        offset_of["REPLAYED_y"],
+        offset_of["ELAPSED_SAMPLES"],
+    )
     answer_input = lanewise(block_layout(spec), f"INPUT Y_{first_sensor} OFF_RECORD", uniform="max_input")(
         plant_stages.replay_sample
     )
@@ -190,7 +206,7 @@ def compile_hold(spec: KernelSpec) -> HoldStages:
     """Compile them; the workspace keeps the block behind the belief that the kernel saves in each sample."""
     offset_of, n_rows = block_offsets(spec), max(block_layout(spec).values()) + 1
     n_saved = len(belief_rows(spec.belief_model)) * LANES
-    terminated, truncated, needs_reset = (offset_of[name] for name in ("TERMINATED", "TRUNCATED", "WAITING"))
+    terminated, truncated, needs_reset = (offset_of[name] for name in ("TERMINATED", "TRUNCATED", "NEEDS_RESET"))
     summed_rows = tuple(offset_of[name] for name in SUMMED_OUTCOMES)
     compile_inner = jit_closure(spec.name)
 

@@ -39,7 +39,7 @@ def expected_sample_source(
     first_assignments: Sequence[tuple[str, Any]] = (),
     keeps_covariance: bool = False,
 ) -> str:
-    """Source of ``name(W)``, which leaves ½ log det C - ½ log det C' of a sample in ``WORK`` [nats].
+    """Source of ``name(W)``, which leaves ½ log det C - ½ log det C' of a sample in ``HOOK_REWARD`` [nats].
 
     Args:
         name: name of the function.
@@ -89,7 +89,9 @@ def expected_sample_source(
         if keeps_covariance
         else {}
     )
-    source += loop(f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept_rows, "WORK": "GAINED"})
+    source += loop(
+        f"{name}_finish", "Its covariance, and what is gained.", lines, {**kept_rows, "HOOK_REWARD": "GAINED"}
+    )
     return source + f"@scalar_jit\ndef {name}(W):\n{body}    {name}_finish(W)\n"
 
 

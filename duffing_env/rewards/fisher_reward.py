@@ -22,7 +22,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
 
     model = spec.belief_model
     truth_rows = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
-    truth_rows |= {name: f"I_{name}" for name in belief_rows(model) if name.startswith("P_")}
+    truth_rows |= {name: f"FISHER_{name}" for name in belief_rows(model) if name.startswith("P_")}
     names, stds = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)], noise_std_rows(spec.truth_model).values()
     noises = [(name, symbol(std) ** 2) for name, std in zip(names, stds, strict=True)]
     return expected_sample_source("update_ideal", spec, loop, truth_rows, noises, keeps_covariance=True)
@@ -33,9 +33,9 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     row_of, model, update_ideal = block_layout(spec), spec.belief_model, generated.update_ideal
     names = belief_rows(model)
     information_rows = tuple(
-        (names.index(name), row_of[f"I_{name}"] * LANES) for name in names if name.startswith("P_")
+        (names.index(name), row_of[f"FISHER_{name}"] * LANES) for name in names if name.startswith("P_")
     )
-    elapsed_row = row_of["ELAPSED"] * LANES
+    elapsed_row = row_of["ELAPSED_SAMPLES"] * LANES
     if model.n_outputs > 1:
         raise ValueError(f"reward 'fisher' is for one sensor, but {model.name!r} has {model.n_outputs}")
 

@@ -16,7 +16,7 @@ from estimator.inference import mean_field
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """A hook that reads the free energy after the update."""
-    free_energies_of, reward_row = _compile_free_energies(spec), block_layout(spec)["WORK"] * LANES
+    free_energies_of, reward_row = _compile_free_energies(spec), block_layout(spec)["HOOK_REWARD"] * LANES
 
     @jit_closure(spec.name)
     def after(W, params):

@@ -8,7 +8,7 @@ from estimator.compilation.simd import jit
 
 
 class RewardHooks(NamedTuple):
-    """The compiled functions that compute a reward's term and leave it in row ``WORK``.
+    """The compiled functions that compute a reward's term and leave it in row ``HOOK_REWARD``.
 
     Attributes:
         on_episode_start: ``on_episode_start(W, j, params)`` where an episode begins in lane j, or its truth changes.

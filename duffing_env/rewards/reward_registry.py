@@ -75,7 +75,7 @@ class Reward:
 
     Attributes:
         weights: weights of the decrease of entropy [nats], the increase of the log posterior at the truth [nats], the
-            decrease of the parameter error, and row ``WORK``, which the hooks write.
+            decrease of the parameter error, and row ``HOOK_REWARD``, which the hooks write.
         needs_truth: whether it compares with the true plant.
         compile_hooks: ``compile_hooks(spec, generated)`` makes the hooks, of the functions that are generated for an
             environment (`duffing_env.kernel_stages.env_codegen`); None for a reward without hooks.

@@ -54,8 +54,8 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     from estimator.engine.symbolic import differentiate, propagate_state, substitute, symbol
 
     model = spec.belief_model
-    believed = {x: f"MODEL_{x}" for x in model.states} | {c: c for c in model.coefficients}
-    true = {x: f"TWIN_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
+    believed = {x: f"SIMULATED_BELIEVED_{x}" for x in model.states} | {c: c for c in model.coefficients}
+    true = {x: f"SIMULATED_TRUE_{x}" for x in model.states} | {c: f"TRUE_{c}" for c in model.coefficients}
     substep_arguments = ("TAU",) if model.is_continuous else ()
     source_text = loop(
         "step_believed", "The believed plant moves.", *propagate_state(model, spec.degree, believed), *substep_arguments
@@ -66,26 +66,31 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     output_expression = differentiate(model).outputs[0].subs(symbol("u"), 0)
     believed_output, true_output = (substitute([("", output_expression)], names)[0][1] for names in (believed, true))
     lines = [
-        ("E_d", symbol("DEVIATION") + (believed_output - true_output) ** 2),
-        ("E_p", symbol("POWER") + true_output**2),
+        ("E_d", symbol("SUM_SQUARED_DIFFERENCE") + (believed_output - true_output) ** 2),
+        ("E_p", symbol("SUM_SQUARED_TRUE") + true_output**2),
     ]
-    source_text += loop("add_difference", "Add up what differs.", lines, {"DEVIATION": "E_d", "POWER": "E_p"})
-    misfit = sp.sqrt(symbol("DEVIATION") / symbol("POWER"))
+    source_text += loop(
+        "add_difference", "Add up what differs.", lines, {"SUM_SQUARED_DIFFERENCE": "E_d", "SUM_SQUARED_TRUE": "E_p"}
+    )
+    misfit = sp.sqrt(symbol("SUM_SQUARED_DIFFERENCE") / symbol("SUM_SQUARED_TRUE"))
     # ``reaches`` is 0 for NaN, which so counts as 1.
     bounded_misfit = sp.Function("select")(sp.Function("reaches")(sp.S.One, symbol("RATIO")), symbol("RATIO"), sp.S.One)
-    lines = [("RATIO", misfit), ("KEPT", bounded_misfit), ("FALL", symbol("MISFIT") - symbol("KEPT"))]
+    lines = [("RATIO", misfit), ("KEPT", bounded_misfit), ("FALL", symbol("SIMULATION_ERROR") - symbol("KEPT"))]
     return source_text + loop(
-        "finish_misfit", "The misfit, and its decrease.", lines, {"WORK": "FALL", "MISFIT": "KEPT"}
+        "finish_misfit", "The misfit, and its decrease.", lines, {"HOOK_REWARD": "FALL", "SIMULATION_ERROR": "KEPT"}
     )
 
 
 def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
     """Hooks that run both plants at the start of an episode and after every update."""
     row_of, model = block_layout(spec), spec.belief_model
-    first, last = row_of[f"MODEL_{next(iter(model.states))}"] * LANES, (row_of["POWER"] + 1) * LANES
+    first, last = (
+        row_of[f"SIMULATED_BELIEVED_{next(iter(model.states))}"] * LANES,
+        (row_of["SUM_SQUARED_TRUE"] + 1) * LANES,
+    )
     rows = [row_of[row] for row in input_rows(model, spec.degree)]
     inputs, feed_input = tuple(row * LANES for row in rows), compile_input_writer(model, spec.degree, rows, LANES)
-    reward_row, misfit_row = row_of["WORK"] * LANES, row_of["MISFIT"] * LANES
+    reward_row, misfit_row = row_of["HOOK_REWARD"] * LANES, row_of["SIMULATION_ERROR"] * LANES
     step_believed, step_true, add_difference, finish_misfit = (
         generated.step_believed,
         generated.step_true,

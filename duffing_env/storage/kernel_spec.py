@@ -222,16 +222,35 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     row_names += noise_std_rows(truth).values()  # behind the parameters, as `draw_plant_parameters` expects
     row_names += [f"X_{x}" for x in truth.states]
     row_names += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
-    row_names += [f"PER_{p}" for p in estimated_expressions(belief)]
-    row_names += ["STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d", "NOISE_w", "NOISE_v"]
-    row_names += ["INPUT", "LAST_INPUT", "OLDER_INPUT", "RISE", "ASKED", "SPENT", "JUMP_AT", "JUMP_FACTOR"]
-    row_names += ["ELAPSED", "WAITING", "RECORDED_u", "RECORDED_y", "LOG_DET", "LOG_DENSITY", "ERROR", "WORK", "EARNED"]
+    row_names += [f"INVERSE_TRUE_{p}" for p in estimated_expressions(belief)]
+    row_names += ["SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d", "NOISE_w", "NOISE_v"]
+    row_names += [
+        "INPUT",
+        "LAST_INPUT",
+        "OLDER_INPUT",
+        "RISE",
+        "REQUESTED_INPUT",
+        "ENERGY_SPENT",
+        "JUMP_AT",
+        "JUMP_FACTOR",
+    ]
+    row_names += [
+        "ELAPSED_SAMPLES",
+        "NEEDS_RESET",
+        "REPLAYED_u",
+        "REPLAYED_y",
+        "LOG_DET",
+        "LOG_DENSITY",
+        "PARAMETER_ERROR",
+        "HOOK_REWARD",
+        "EPISODE_RETURN",
+    ]
     row_names += OUTCOME_ROWS
     if spec.reward_hooks == "fisher":
-        row_names += [f"I_{name}" for name in belief_rows(belief) if name.startswith("P_")]
+        row_names += [f"FISHER_{name}" for name in belief_rows(belief) if name.startswith("P_")]
     if spec.reward_hooks == "simulation_error":
-        row_names += [f"{who}_{x}" for who in ("MODEL", "TWIN") for x in belief.states]
-        row_names += ["DEVIATION", "POWER", "MISFIT"]
+        row_names += [f"{who}_{x}" for who in ("SIMULATED_BELIEVED", "SIMULATED_TRUE") for x in belief.states]
+        row_names += ["SUM_SQUARED_DIFFERENCE", "SUM_SQUARED_TRUE", "SIMULATION_ERROR"]
     if spec.factorisation == "mean_field":
         from estimator.inference import mean_field
 

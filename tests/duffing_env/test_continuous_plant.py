@@ -21,7 +21,7 @@ EXPERIMENT = ContinuousExperiment()
 KIND = EXPERIMENT.kernel_spec._replace(degree=1)  # which holds an input that does not rise
 HELD = KIND._replace(plant_model=duffing(noise="held"))
 PLACE = block_layout(KIND)
-STREAM = ("STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d")
+STREAM = ("SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d")
 RATES = ("TRUE_stiffness", "TRUE_cubic", "TRUE_damping", "TRUE_gain")
 
 
@@ -142,7 +142,7 @@ def test_the_sensor_adds_its_noise():
 
 def test_the_streams_of_waiting_lanes_stand_still():
     waiting = np.arange(LANES) % 2
-    by_row = lanes(WAITING=waiting)
+    by_row = lanes(NEEDS_RESET=waiting)
     places = [PLACE[name] for name in STREAM]
     before = by_row[places].view(np.uint64).copy()
     step(by_row, 1e-3, 1e-3)

@@ -43,7 +43,7 @@ def test_limits_hold_for_every_sample():
     np.testing.assert_allclose(np.diff([0.0, *inputs[:5]]), 0.02, rtol=1e-12)
     assert np.abs(np.diff(inputs)).max() <= 0.15
     assert np.sum(np.square(inputs)) <= 64 * 0.05**2 * (1 + 1e-12)
-    np.testing.assert_array_equal(envs._batch.row_values("SPENT"), single._batch.row_values("SPENT")[0])
+    np.testing.assert_array_equal(envs._batch.row_values("ENERGY_SPENT"), single._batch.row_values("ENERGY_SPENT")[0])
 
 
 def test_every_sample_is_drawn():

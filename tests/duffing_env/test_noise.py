@@ -30,7 +30,7 @@ def numpy_stream(words):
 
 def words_of(batch, row):
     """The four words of a row's stream."""
-    first = batch._row_of["STREAM_a"]
+    first = batch._row_of["SFC64_a"]
     return batch._blocks[row // LANES, first : first + 4, row % LANES].copy().view(np.uint64)
 
 
@@ -50,7 +50,7 @@ def normals():
     for t in range(noise.shape[1]):
         batch.step(np.zeros(500))
         noise[:, t] = batch.row_values("NOISE_w"), batch.row_values("NOISE_v")
-    assert not batch.row_values("WAITING").any()
+    assert not batch.row_values("NEEDS_RESET").any()
     return noise
 
 

@@ -14,7 +14,7 @@ from estimator.compilation.simd import LANES
 
 KIND = SimulatedExperiment().kernel_spec
 PLACE = block_layout(KIND)
-STREAM = ("STREAM_a", "STREAM_b", "STREAM_c", "STREAM_d")
+STREAM = ("SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d")
 COEFFICIENTS = ("TRUE_theta1", "TRUE_theta2", "TRUE_theta3", "TRUE_eta")
 TRUE = dict(zip(COEFFICIENTS, to_coefficients(SILVERBOX_TWIN), strict=True))
 
@@ -78,7 +78,7 @@ def test_it_blows_up_where_the_documentation_says():
 def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
     words = np.random.default_rng(0).integers(1, 2**60, (4, LANES), dtype=np.uint64)
     waiting = np.arange(LANES) % 2
-    flat, row = block(WAITING=waiting, **dict(zip(STREAM, words.view(np.float64), strict=True)))
+    flat, row = block(NEEDS_RESET=waiting, **dict(zip(STREAM, words.view(np.float64), strict=True)))
     compile_noise_draw(PLACE)(flat)
     still = np.stack([row(name) for name in STREAM]).copy().view(np.uint64) == words
     np.testing.assert_array_equal(still.all(axis=0), waiting == 1)
@@ -87,5 +87,5 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
 @pytest.mark.parametrize(("deviation", "off_record"), [(0.0, 0.0), (2e-8, 0.0), (-2e-8, 0.0), (1e-7, 1.0), (-0.1, 1.0)])
 def test_a_record_answers_the_recorded_input_only(deviation, off_record):
     # A float32 action in [-1, 1] is within 3e-8 of the number that it stands for; here it is scaled by 0.15.
-    answer = replay_sample(0.1 + deviation, RECORDED_u=0.1, RECORDED_y=-0.3, max_input=0.15)
+    answer = replay_sample(0.1 + deviation, REPLAYED_u=0.1, REPLAYED_y=-0.3, max_input=0.15)
     assert answer == (0.1, -0.3, off_record)

@@ -120,7 +120,7 @@ class TestWithTheRecord:
         left = 1000
         assert envs.horizon == len(record.arrow.u) - delay
         np.testing.assert_array_equal(envs.recorded_input, record.arrow.u)
-        overwrite(envs, "ELAPSED", float(envs.horizon - left))
+        overwrite(envs, "ELAPSED_SAMPLES", float(envs.horizon - left))
         actions = recorded_actions(envs, envs.horizon)[-left:]
         *steps, last = (envs.step(action[None]) for action in actions)
         assert not any(step[2].any() or step[3].any() or step[4]["off_record"].any() for step in steps)

@@ -30,9 +30,9 @@ WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  
 @cache
 def payer(kind):
     """`pay` in a block of a kind."""
-    return lanewise(block_layout(kind), "REWARD EARNED", uniform="terminal has_terminated_return terminated_return")(
-        pay_reward
-    )
+    return lanewise(
+        block_layout(kind), "REWARD EPISODE_RETURN", uniform="terminal has_terminated_return terminated_return"
+    )(pay_reward)
 
 
 class Lanes:
@@ -124,7 +124,7 @@ def assert_appraised_as_a_gaussian(nonlinear, seed):
 
     estimate = to_parameters(mean)[: len(active)]
     error = np.abs(estimate / [truth.m, truth.c, truth.a, truth.b][: len(active)] - 1.0)
-    np.testing.assert_allclose(lanes["ERROR"], np.minimum(error, 1.0).mean(), rtol=1e-10)
+    np.testing.assert_allclose(lanes["PARAMETER_ERROR"], np.minimum(error, 1.0).mean(), rtol=1e-10)
 
 
 @pytest.mark.parametrize("nonlinear", [True, False])
@@ -145,7 +145,7 @@ def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
     lanes = Lanes(reward=reward)
     before = lanes.belief
     lanes.set_coefficients(*random_belief(np.random.default_rng(1)))
-    lanes["WORK"][:] = 1.25
+    lanes["HOOK_REWARD"][:] = 1.25
     after, truth = lanes.belief, lanes.truth
 
     def error(belief):
@@ -176,21 +176,21 @@ def test_the_error_of_each_parameter_is_capped():
     far = to_coefficients(Parameters(zip(PARAMETERS, TWIN * [5.0, 1.0, -1.0, 1.0], strict=True)))
     lanes.set_coefficients(far, lanes.belief.coefficients_cov)
     lanes.appraise()
-    np.testing.assert_allclose(lanes["ERROR"], 0.5, rtol=1e-12)  # m and a are off by more than themselves
+    np.testing.assert_allclose(lanes["PARAMETER_ERROR"], 0.5, rtol=1e-12)  # m and a are off by more than themselves
     lanes["eta"][:] = 0.0  # as if the input had no effect: no parameter can be told
     lanes.appraise()
-    np.testing.assert_array_equal(lanes["ERROR"], 1.0)
+    np.testing.assert_array_equal(lanes["PARAMETER_ERROR"], 1.0)
 
 
 def test_episodes_end_at_the_limit_or_at_the_horizon():
     lanes = Lanes()
     lanes["Y_y"][:4] = MAX_OUTPUT, np.nextafter(MAX_OUTPUT, 1), -MAX_OUTPUT, -0.7
-    lanes["ELAPSED"][4:7] = HORIZON - 2, HORIZON - 1, HORIZON - 1
+    lanes["ELAPSED_SAMPLES"][4:7] = HORIZON - 2, HORIZON - 1, HORIZON - 1
     lanes["Y_y"][6] = 0.7
     lanes.settle()
     assert lanes["TERMINATED"][:8].tolist() == [0, 1, 0, 1, 0, 0, 1, 0]
     assert lanes["TRUNCATED"][:8].tolist() == [0, 0, 0, 0, 0, 1, 0, 0]
-    assert lanes["ELAPSED"][:8].tolist() == [1, 1, 1, 1, HORIZON - 1, HORIZON, HORIZON, 1]
+    assert lanes["ELAPSED_SAMPLES"][:8].tolist() == [1, 1, 1, 1, HORIZON - 1, HORIZON, HORIZON, 1]
     assert not lanes["DIVERGED"].any()
 
 
@@ -212,9 +212,9 @@ def impossible():
 def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
     for name, value in impossible():
         lanes = Lanes(reward=reward)
-        lanes["ELAPSED"][:] = HORIZON - 1
-        lanes["WORK"][:] = 2.0
-        before = lanes["LOG_DET"][1], lanes["LOG_DENSITY"][1], lanes["ERROR"][1]
+        lanes["ELAPSED_SAMPLES"][:] = HORIZON - 1
+        lanes["HOOK_REWARD"][:] = 2.0
+        before = lanes["LOG_DET"][1], lanes["LOG_DENSITY"][1], lanes["PARAMETER_ERROR"][1]
         lanes[name][1] = value
         lanes.settle()
         case = f"{name} = {value}"
@@ -223,14 +223,14 @@ def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
         assert lanes["TRUNCATED"][1] == 0, case
         for outcome in ("REWARD", "INFORMATION_GAIN", "LOG_POSTERIOR_GAIN"):
             assert lanes[outcome][1] == 0, case
-        assert (lanes["LOG_DET"][1], lanes["LOG_DENSITY"][1], lanes["ERROR"][1]) == before, case
+        assert (lanes["LOG_DET"][1], lanes["LOG_DENSITY"][1], lanes["PARAMETER_ERROR"][1]) == before, case
 
 
 @pytest.mark.parametrize("reward", WORKED)
 def test_work_that_is_not_finite_ends_the_episode(reward):
     for paid in (np.nan, np.inf, -np.inf):
         lanes = Lanes(reward=reward)
-        lanes["WORK"][3] = paid
+        lanes["HOOK_REWARD"][3] = paid
         lanes.settle()
         assert np.flatnonzero(lanes["DIVERGED"]).tolist() == [3]
         np.testing.assert_array_equal(lanes["REWARD"], 0.0)
@@ -250,10 +250,10 @@ def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
 def three_steps(**options):
     """Rewards (3, LANES) of steps that are worth 1, 2 and 3, less a cost of ½; lane 1 is terminated by the last."""
     lanes, paid = Lanes(reward="fisher"), []
-    lanes["ELAPSED"][:] = HORIZON - 3
+    lanes["ELAPSED_SAMPLES"][:] = HORIZON - 3
     lanes["INPUT"][:] = 0.1
     for worth in (1.0, 2.0, 3.0):
-        lanes["WORK"][:] = worth
+        lanes["HOOK_REWARD"][:] = worth
         lanes["Y_y"][1] = 0.7 if worth == 3.0 else 0.0
         lanes.settle(input_cost=50.0, **options)
         paid.append(lanes["REWARD"].copy())
@@ -280,7 +280,7 @@ def test_an_episode_that_is_terminated_returns_what_was_said(terminal):
 
 def test_an_episode_that_diverges_returns_what_was_said():
     lanes = Lanes(reward="fisher")
-    lanes["WORK"][:] = 4.0
+    lanes["HOOK_REWARD"][:] = 4.0
     lanes.settle(terminated_return=-1.0)
     lanes["X_x1"][2] = np.nan
     lanes.settle(terminated_return=-1.0)

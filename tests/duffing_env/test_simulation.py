@@ -52,6 +52,6 @@ def test_it_falls_with_what_is_learned_and_sums_to_at_most_one():
     sums = np.cumsum(rewards_paid, axis=0)
     assert np.abs(sums).max() <= 1
     assert (np.diff(sums[[0, 15, 63, 255]].mean(axis=1)) > 0).all()
-    errors = envs._batch.row_values("MISFIT")
+    errors = envs._batch.row_values("SIMULATION_ERROR")
     assert sums[-1].mean() > 0.7
     assert ((errors >= 0) & (errors <= 1)).all()

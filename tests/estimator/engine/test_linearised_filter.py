@@ -34,7 +34,7 @@ def some_walk(case, seed):
 def start(case, layout, z, V, c, noises, W, lane=0, lanes=1):
     """``noises``: variances of the process noise and of each sensor's."""
     states = list(case.model.states)
-    values = dict(zip((*states, *case.model.coefficients), (*z, *c), strict=True)) | {"LIVE": 1.0}
+    values = dict(zip((*states, *case.model.coefficients), (*z, *c), strict=True)) | {"IS_COUNTED": 1.0}
     values |= {f"V_{i}_{k}": V[a, b] for a, i in enumerate(states) for b, k in enumerate(states) if a <= b}
     values |= dict(zip(("Q", *(f"R_{s}" for s in case.model.outputs)), noises, strict=True))
     put(W, layout, lanes, lane, values)
@@ -210,7 +210,7 @@ def test_a_lane_that_is_over_counts_nothing():
     z, V, c, inputs, R, y = some_walk(case, 5)
     W = block(task.layout, 1)
     start(case, task.layout, z, V, c, (NOISE, *R), W)
-    W[task.layout["LIVE"]] = 0.0
+    W[task.layout["IS_COUNTED"]] = 0.0
     feed(case, task.layout, inputs[0], y[0], W)
     task.sample(W)
     totals = [W[place] for row, place in task.layout.items() if row == "LOSS" or row[:2] == "F_" or row[:5] == "SLOPE"]
