@@ -36,7 +36,7 @@ def assert_equals_reference(case, task, samples):
         # A factor of m columns sums m products for each of m rows; 2 m images are summed in turn.
         m = len(case.model.names)
         assert_agrees(get_belief(W, task.layout, LANES, lane, case), expected, case.operations + m * m + 4 * m)
-        assert W[task.layout["UNSOUND"] * LANES + lane] == 0
+        assert W[task.layout["INDEFINITE_COUNT"] * LANES + lane] == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -134,7 +134,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
         task.count_unsound(W)
         for lane in range(LANES):
             cov = get_belief(W, task.layout, LANES, lane, case).cov
-            if table[task.layout["UNSOUND"], lane] > 0:
+            if table[task.layout["INDEFINITE_COUNT"], lane] > 0:
                 flagged += 1
                 continue
             assert np.isfinite(cov).all()
@@ -172,7 +172,7 @@ def test_what_is_no_covariance_is_flagged(entries, flagged):
     for lane in range(LANES):
         put_belief(W, task.layout, LANES, lane, case, replace(belief, cov=cov if lane == 2 else np.eye(5)))
     task.count_unsound(W)
-    counts = W.reshape(-1, LANES)[task.layout["UNSOUND"]]
+    counts = W.reshape(-1, LANES)[task.layout["INDEFINITE_COUNT"]]
     np.testing.assert_array_equal(counts > 0, [flagged and lane == 2 for lane in range(LANES)])
 
 

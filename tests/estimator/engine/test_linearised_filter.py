@@ -35,8 +35,8 @@ def start(case, layout, z, V, c, noises, W, lane=0, lanes=1):
     """``noises``: variances of the process noise and of each sensor's."""
     states = list(case.model.states)
     values = dict(zip((*states, *case.model.coefficients), (*z, *c), strict=True)) | {"IS_COUNTED": 1.0}
-    values |= {f"V_{i}_{k}": V[a, b] for a, i in enumerate(states) for b, k in enumerate(states) if a <= b}
-    values |= dict(zip(("Q", *(f"R_{s}" for s in case.model.outputs)), noises, strict=True))
+    values |= {f"P_{i}_{k}": V[a, b] for a, i in enumerate(states) for b, k in enumerate(states) if a <= b}
+    values |= dict(zip(("PROCESS_VARIANCE", *(f"R_{s}" for s in case.model.outputs)), noises, strict=True))
     put(W, layout, lanes, lane, values)
 
 
@@ -51,7 +51,7 @@ def matrix(W, layout, lanes, lane, rows, columns):
     """Rows ``<letter>_i_k`` as a matrix; the upper triangle twice where only that is there."""
     letter, first = rows
     at = lambda i, k: W[layout[f"{letter}_{i}_{k}"] * lanes + lane]  # noqa: E731
-    if letter == "Z":
+    if letter == "DX":
         return np.array([[at(i, k) for k in columns] for i in first])
     return np.array([[at(first[min(a, b)], first[max(a, b)]) for b in range(len(first))] for a in range(len(first))])
 
@@ -67,7 +67,7 @@ def walked(case, task, walks, observed):
             feed(case, task.layout, inputs[t], y[t] if observed else None, W, lane, lanes)
         task.sample(W)
         if not observed:
-            shown.append([W[task.layout[f"SHOWN_{s}"] * lanes] for s in case.model.outputs])
+            shown.append([W[task.layout[f"Y_PRED_{s}"] * lanes] for s in case.model.outputs])
     return W, np.array(shown)
 
 
@@ -99,20 +99,22 @@ def assert_equals_reference(case, task, observed):
     assert tolerance < 1e-8
     F = expected.information
     size = np.sqrt(np.diag(F))
-    assert (np.abs(matrix(W, layout, lanes, lane, ("F", names), names) - F) <= tolerance * np.outer(size, size)).all()
+    assert (
+        np.abs(matrix(W, layout, lanes, lane, ("INFORMATION", names), names) - F) <= tolerance * np.outer(size, size)
+    ).all()
     np.testing.assert_allclose([at(i) for i in states], expected.state, rtol=tolerance, atol=tolerance)
     std = np.sqrt(np.diag(expected.cov))
-    V_end = matrix(W, layout, lanes, lane, ("V", states), states)
+    V_end = matrix(W, layout, lanes, lane, ("P", states), states)
     assert (np.abs(V_end - expected.cov) <= tolerance * np.outer(std, std)).all()
     reach = np.abs(expected.sensitivity).max()
-    Z_end = matrix(W, layout, lanes, lane, ("Z", states), names)
+    Z_end = matrix(W, layout, lanes, lane, ("DX", states), names)
     np.testing.assert_allclose(Z_end, expected.sensitivity, atol=tolerance * reach, rtol=0)
     if observed:
         # An error of the innovations e counts 1/√S: they are 1e2 of what is rounded.
         enlarged = tolerance / np.sqrt(R.min())
         total = SAMPLES * len(R) * (1 + abs(np.log(R.min())))
         assert at("LOSS") == pytest.approx(expected.loss, abs=enlarged * total)
-        slope = np.array([at(f"SLOPE_{i}") for i in names])
+        slope = np.array([at(f"GRADIENT_{i}") for i in names])
         assert (np.abs(slope - expected.gradient) <= enlarged * size * np.sqrt(total)).all()
         assert np.abs(expected.gradient / size).max() > 0.1
     else:
@@ -142,7 +144,7 @@ def test_the_information_is_that_of_the_responses_slopes(name):
     slopes = central(response, c, 1e-3)
     expected = np.einsum("tsi,tsj,s->ij", slopes, slopes, 1 / R)
     names = list(case.model.coefficients)
-    found = matrix(W, task.layout, 1, 0, ("F", names), names)
+    found = matrix(W, task.layout, 1, 0, ("INFORMATION", names), names)
     size = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
 
@@ -213,7 +215,9 @@ def test_a_lane_that_is_over_counts_nothing():
     W[task.layout["IS_COUNTED"]] = 0.0
     feed(case, task.layout, inputs[0], y[0], W)
     task.sample(W)
-    totals = [W[place] for row, place in task.layout.items() if row == "LOSS" or row[:2] == "F_" or row[:5] == "SLOPE"]
+    totals = [
+        W[place] for row, place in task.layout.items() if row == "LOSS" or row.startswith(("INFORMATION_", "GRADIENT_"))
+    ]
     np.testing.assert_array_equal(totals, 0.0)
 
 
