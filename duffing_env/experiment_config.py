@@ -324,16 +324,17 @@ def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be an estimator.Belief or None, but is {short_repr(prior)}")
     if prior.scales != scales:
-        pairs = {name: (getattr(scales, name), getattr(prior.scales, name)) for name in asdict(scales)}
-        scale_words = {"input": "limit", "output": "range", "order": "time derivative that the sensor shows"}
-        differences = ", ".join(
-            f"{scale_words.get(name, name)} {found!r} in place of {required!r}"
-            for name, (required, found) in pairs.items()
-            if required != found
-        )
+        scale_words = {"input": "limit", "output": "range", "order": "order of the output's derivative"}
+        differences = [
+            (scale_words.get(name, name.replace("_", " ")), getattr(prior.scales, name), required)
+            for name, required in asdict(scales).items()
+            if required != getattr(prior.scales, name)
+        ]
+        found = " and ".join(f"{name} {value!r}" for name, value, _ in differences)
+        wanted = " and ".join(f"{name} {value!r}" for name, _, value in differences)
         raise ValueError(
-            f"prior must have the rig's scales, limit and range, but has {differences}; identify once more with the "
-            f"present rig, and save that belief"
+            f"prior must have the scales of the rig, but was saved with {found}, and the rig says {wanted}; identify "
+            f"once more with the present rig and save that, or change the rig back"
         )
     if model is not None and prior.model != model:
         raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

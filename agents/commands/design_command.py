@@ -52,8 +52,8 @@ class DesignCommand:
         check_distinct_files(
             {"output": self.output, "figure": self.figure}, [self.rig, *filter(None, [self.posterior])]
         )
-        check_not_overwritten("output", self.output, self.force)
-        check_not_overwritten("figure", self.figure, self.force)
+        check_not_overwritten("-o/--output", self.output, self.force)
+        check_not_overwritten("--figure", self.figure, self.force)
         if self.figure is not None:
             require_packages("matplotlib")
             if self.figure.suffix.lower() != ".png":
@@ -85,18 +85,17 @@ def print_experiment_design(design: ExperimentDesign) -> None:
     from agents.console_output import print_texts_and_tables as print_all
     from agents.hardware.next_experiment import undersampling_message
     from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD
-    from estimator.rigs.units import digits_to_distinguish
+    from estimator.rigs.units import format_interval
 
     rows = []
     for row in design.parameter_rows():
+        mean_text, low_text, high_text = format_interval(row.mean, *row.interval, 5)
         low, high = row.interval
-        digits = digits_to_distinguish(low, high, 5)
-        mean = row.mean if abs(row.mean) > 1e-9 * (high - low) else 0.0  # 0 but for rounding
         rows.append(
             [
                 row.name,
-                f"{mean:.{digits}g}",
-                f"{low:.{digits}g} to {high:.{digits}g}",
+                mean_text,
+                f"{low_text} to {high_text}",
                 f"± {row.expected_half_width:.2g}",
                 f"{(high - low) / 2 / row.expected_half_width:.3g}",
                 row.unit,

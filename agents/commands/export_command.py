@@ -44,7 +44,7 @@ class ExportCommand:
         from agents.policies.signal_export import export_signal
         from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 
-        check_not_overwritten("output", self.output, self.force)
+        check_not_overwritten("-o/--output", self.output, self.force)
         if self.output.suffix == ".onnx":
             self._export_network()
             return

@@ -86,6 +86,8 @@ def result_to_dict(result: Result) -> dict[str, Any]:
                 "step": record.step or result.rig.step,
                 "missing": record.n_missing,
                 "clipped": record.n_clipped,
+                "input": record.columns.input if record.columns else None,
+                "output": record.columns.output if record.columns else None,
             }
             for record in result.records
         ],
@@ -117,6 +119,12 @@ def sampling_step_sentences(result: Result) -> list[str]:
     return list(dict.fromkeys(sentences))
 
 
+def column_sentences(result: Result) -> list[str]:
+    """Sentences: which columns were taken, once for all files with the same names."""
+    kind = result.rig.output.kind
+    return list(dict.fromkeys(one.columns.sentence(kind) for one in result.records if one.columns))
+
+
 def _format_sampling_step(step: float) -> str:
     return f"{step:.6g} s ({1 / step:.6g} Hz)"
 
@@ -127,16 +135,17 @@ def print_identification(result: Result) -> None:
 
     from agents.console_output import format_table, rich_console
     from agents.console_output import print_texts_and_tables as print_all
-    from estimator.rigs.units import digits_to_distinguish
+    from estimator.rigs.units import format_interval
     from estimator.support.argument_checks import mask_control_codes
 
     units, intervals, rows = result.units, result.interval(0.9), []
     for name, (mean, _) in result.parameters.items():
         low, high = intervals[name]
-        digits = digits_to_distinguish(low, high, 5)
-        value = "open" if name in result.unidentified else f"{mean:.{digits}g}"
-        rows.append([name, value, f"{low:.{digits}g} to {high:.{digits}g}", units[name]])
+        mean_text, low_text, high_text = format_interval(mean, low, high, 5)
+        value = "open" if name in result.unidentified else mean_text
+        rows.append([name, value, f"{low_text} to {high_text}", units[name]])
     print_all(
+        *column_sentences(result),
         *sampling_step_sentences(result),
         "m x'' + c x' + a x + b x³ = u - u0 + w, measured with the offset y0",
         format_table(("", "mean", "90 % interval", "unit"), rows),

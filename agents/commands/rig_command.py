@@ -43,7 +43,7 @@ class RigInitCommand:
         from estimator.rigs.rig import SHIPPED_RIGS
         from estimator.support.file_io import write_atomically
 
-        check_not_overwritten("path", self.path, self.force)
+        check_not_overwritten("path of the rig file", self.path, self.force)
         for name in ("step", "input", "output"):
             if getattr(self, name) is not None and (self.source is None or self.source in SHIPPED_RIGS):
                 raise ValueError(f"{name} goes with a record; add --from data.csv, or leave it out")

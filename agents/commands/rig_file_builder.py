@@ -25,7 +25,7 @@ _NOT_KNOWN = "not known"
 def rig_text_from_record(
     path: Path, step: float | None = None, input_column: str | None = None, output_column: str | None = None
 ) -> tuple[str, str]:
-    """The rig file for a record, and sentences about the source of its step and units.
+    """The rig file for a record, and sentences about the source of its columns, step and units.
 
     The step is of the column of times; units and kind are of the names of the columns, but in SI units without prefix,
     so that results are in kg and N/m also where a column is in mm. A MAT file has none of these.
@@ -50,8 +50,10 @@ def rig_text_from_record(
         if step is None:
             raise ValueError(f"{path} must be a CSV file to have a step, but is a MAT file; add --step SECONDS")
         rig = Rig(step, input=Channel(column=input_column), output=Channel(column=output_column))
-        read_record_file(path, rig)
-        return rig.to_toml(f", from {mask_control_codes(path.name)}"), _sampling_step_sentence(step, "--step")
+        columns = read_record_file(path, rig)[0].columns
+        sentences = [columns.sentence(rig.output.kind, is_kind_known=False)] if columns else []
+        sentences.append(_sampling_step_sentence(step, "--step"))
+        return rig.to_toml(f", from {mask_control_codes(path.name)}"), "\n".join(sentences)
     table = read_table(path, input_column, output_column)
     step_of_times = table.step()
     if step is None and step_of_times is None:
@@ -68,23 +70,22 @@ def rig_text_from_record(
         # Times are rounded, so that the last digits of their mean difference are wrong.
         step = float(f"{step_of_times:.6g}")
         step_source = f"the times in {table.names[table.time_column or 0]:.60}" if table.names else "the first column"
-    sentences = [_sampling_step_sentence(step, step_source)]
+    known_kind = table.output_kind()
+    kind = known_kind or "displacement"
+    columns = table.column_names()
+    sentences = [columns.sentence(kind, known_kind is not None), _sampling_step_sentence(step, step_source)]
     input_unit, output_unit = (
         None if place is None else table.unit(place) for place in (table.input_column, table.output_column)
     )
-    # A column without a known name was chosen by its position; its name in the file lets the user check it.
-    column_names = [
-        None if place is None or table.has_known_name(place) else table.names[place]
-        for place in (table.input_column, table.output_column)
-    ]
+    # The file names a column that was not chosen by its name, so that the user can check it.
+    is_written = bool(table.names) and columns.reason != "name"
+    column_names = [name if is_written else None for name in (columns.input, columns.output)]
     # The unit g of an input may be a force.
     si_units = [
         one if one in (None, "g") and k == 0 else to_si_unit(one or "1")[1]
         for k, one in enumerate((input_unit, output_unit))
     ]
-    output = Channel(
-        si_units[1] or "1", kind=table.output_kind() or "displacement", column=output_column or column_names[1]
-    )
+    output = Channel(si_units[1] or "1", kind=kind, column=output_column or column_names[1])
     rig = Rig(step, input=Channel(si_units[0] or "1", column=input_column or column_names[0]), output=output)
     for name, one, base in zip(("input", "output"), (input_unit, output_unit), si_units, strict=True):
         if one and base and conversion_factor(one, base) != 1.0:

@@ -72,11 +72,13 @@ def print_run_result(result: RunResult) -> None:
     """Print the parameters with their intervals, and the number of late ticks."""
     from agents.console_output import format_table
     from agents.console_output import print_texts_and_tables as print_all
+    from estimator.rigs.units import format_interval
 
     intervals, units = result.interval(0.9), result.units
     rows = [
-        [name, f"{mean:.5g}", f"{intervals[name][0]:.5g} to {intervals[name][1]:.5g}", units[name]]
+        [name, mean_text, f"{low_text} to {high_text}", units[name]]
         for name, (mean, _) in result.parameters.items()
+        for mean_text, low_text, high_text in [format_interval(mean, intervals[name][0], intervals[name][1], 5)]
     ]
     late = (
         f"{result.late_ticks} ticks of the clock were missed"

@@ -18,7 +18,7 @@ from estimator.identification.report_figures import (
 )
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
-from estimator.rigs.units import digits_to_distinguish
+from estimator.rigs.units import format_interval
 from estimator.support.array_types import FloatArray
 from estimator.support.file_io import write_atomically
 from estimator.support.html_page import figure_to_svg, html_document, html_table
@@ -113,9 +113,9 @@ def _parameters_html(content: ReportContent) -> str:
     rows = []
     for name, (mean, std) in content.parameters.items():
         low, high = content.intervals[name]
-        digits = digits_to_distinguish(low, high, 6)
-        mean_text = "open" if name in content.unidentified else f"{mean:.{digits}g}"
-        interval = f"{low:.{digits}g} to {high:.{digits}g}"
+        mean_text, low_text, high_text = format_interval(mean, low, high, 6)
+        mean_text = "open" if name in content.unidentified else mean_text
+        interval = f"{low_text} to {high_text}"
         label = f"{name}, {_PARAMETER_MEANINGS[name]}"
         rows.append([label, mean_text, f"{std:.2g}", interval, escape(content.units[name])])
     channels = (
@@ -125,8 +125,8 @@ def _parameters_html(content: ReportContent) -> str:
     for name, label, channel in channels:
         mean, std = content.noises[name]
         half_width = STDS_PER_90_PERCENT * std
-        interval = f"{max(mean - half_width, 0):.3g} to {mean + half_width:.3g}"
-        rows.append([label, f"{mean:.3g}", f"{std:.1g}", interval, escape(channel.unit)])
+        mean_text, low_text, high_text = format_interval(mean, max(mean - half_width, 0.0), mean + half_width, 3)
+        rows.append([label, mean_text, f"{std:.1g}", f"{low_text} to {high_text}", escape(channel.unit)])
     equation = "<p>m x'' + c x' + a x + b x³ = u - u0 + w, observed with the offset y0 and noise.</p>"
     headings = ["", "mean", "standard deviation", "90 % interval", "unit"]
     return f"<h2>Parameters</h2>{equation}{html_table(headings, rows)}"

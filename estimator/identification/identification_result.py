@@ -19,7 +19,7 @@ from estimator.identification.identification_report import ReportContent, write_
 from estimator.identification.report_figures import FREE_RUN_OUTPUTS
 from estimator.online import OnlineEstimator
 from estimator.rigs.rig import Rig
-from estimator.rigs.units import digits_to_distinguish
+from estimator.rigs.units import format_interval
 from estimator.support.array_types import FloatArray
 
 _Value = TypeVar("_Value")
@@ -169,10 +169,10 @@ class Result:
     def __str__(self) -> str:
         intervals, units = self.interval(0.9), self.units
         rows = [
-            f"{name:>3} = {mean:.{digits}g} {units[name]}, 90 % in [{low:.{digits}g}, {high:.{digits}g}]"
+            f"{name:>3} = {mean_text} {units[name]}, 90 % in [{low_text}, {high_text}]"
             f"{', open' if name in self.unidentified else ''}"
             for (name, (mean, _)), (low, high) in zip(self.parameters.items(), intervals.values(), strict=True)
-            for digits in [digits_to_distinguish(low, high, 6)]
+            for mean_text, low_text, high_text in [format_interval(mean, low, high, 6)]
         ]
         warnings = [f"WARNING {warning}" for warning in self.warnings] or ["no check speaks against this result"]
         return "\n".join([*rows, *warnings])

@@ -187,14 +187,24 @@ def _format_power(power: int) -> str:
     return "" if power == 1 else str(power).translate(SUPERSCRIPTS)
 
 
-def digits_to_distinguish(low: float, high: float, minimum: int) -> int:
-    """Number of significant digits, at least ``minimum``, that distinguish the ends of an interval.
+def format_interval(mean: float, low: float, high: float, minimum: int) -> tuple[str, str, str]:
+    """Mean and ends of an interval with the same decimals and the same power of ten.
+
+    The larger end has ``minimum`` significant digits, or as many as show the width with three digits.
 
     Example:
-        >>> digits_to_distinguish(0.0023, 0.0023000001, 5), digits_to_distinguish(1.0, 2.0, 5)
-        (9, 5)
+        >>> format_interval(0.40028, 0.39935, 0.4012, 5), format_interval(2500.41, 2494.0, 2506.9, 5)
+        (('0.40028', '0.39935', '0.40120'), ('2500.4', '2494.0', '2506.9'))
+        >>> format_interval(4.04e7, 3.96818e7, 4.11173e7, 5), format_interval(1.46e-5, -5.7277e-6, 3.4938e-5, 5)
+        (('4.0400e+07', '3.9682e+07', '4.1117e+07'), ('1.4600e-05', '-0.5728e-05', '3.4938e-05'))
+        >>> format_interval(0.0023, 0.0023, 0.0023000001, 5)
+        ('0.00230000000', '0.00230000000', '0.00230000010')
     """
-    for digits in range(minimum, 16):
-        if f"{low:.{digits}g}" != f"{high:.{digits}g}":
-            return digits if digits == minimum else digits + 1
-    return minimum
+    largest, width = max(abs(low), abs(high)), high - low
+    if not (math.isfinite(largest) and math.isfinite(mean)) or largest == 0:
+        return f"{mean:.{minimum}g}", f"{low:.{minimum}g}", f"{high:.{minimum}g}"
+    exponent = int(f"{largest:.{minimum - 1}e}".partition("e")[2])
+    digits = min(max(minimum, exponent - math.floor(math.log10(width)) + 2), 16) if width > 0 else minimum
+    if -5 < exponent < digits:
+        return tuple(f"{value:z.{digits - 1 - exponent}f}" for value in (mean, low, high))  # type: ignore[return-value]
+    return tuple(f"{value / 10.0**exponent:z.{digits - 1}f}e{exponent:+03d}" for value in (mean, low, high))  # type: ignore[return-value]

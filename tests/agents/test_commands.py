@@ -102,14 +102,22 @@ def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
 def test_columns_of_any_name_are_named_once(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     _, *lines = Path("record.csv").read_text().splitlines()
+    Path("channels.csv").write_text("\n".join(["Zeit [ms],CH1 [N],CH2 [mm]", *lines]))
+    status, told, _ = run("rig", "init", "unit.toml", "--from", "channels.csv")
+    assert status == 0
+    assert "Input: CH1 [N]; output: CH2 [mm], a displacement (by their units)." in told
+    taken = Rig.from_file("unit.toml")
+    assert (taken.input.column, taken.output.column) == ("CH1 [N]", "CH2 [mm]")
     Path("daten.csv").write_text("\n".join(["Zeit [ms],Kraft [N],Weg [mm]", *lines]))
-    assert run("rig", "init", "order.toml", "--from", "daten.csv")[0] == 0
-    taken = Rig.from_file("order.toml")
-    assert (taken.input.column, taken.output.column) == ("Kraft [N]", "Weg [mm]")
-    Path("four.csv").write_text("\n".join(["Zeit [ms],Kraft [N],Weg [mm],Strom [A]", *(f"{one},0" for one in lines)]))
+    status, told, _ = run("rig", "init", "name.toml", "--from", "daten.csv")
+    assert status == 0
+    assert "Input: Kraft [N]; output: Weg [mm], a displacement (by their names)." in told
+    taken = Rig.from_file("name.toml")
+    assert (taken.input.column, taken.output.column) == (None, None)
+    Path("four.csv").write_text("\n".join(["Zeit [ms],CH1 [V],CH2 [V],CH3 [A]", *(f"{one},0" for one in lines)]))
     status, _, told = run("rig", "init", "hart.toml", "--from", "four.csv")
     assert status == 2
-    assert "by --input and --output of duffing-env rig init" in told
+    assert "name both by --input and --output of duffing-env rig init" in told
     assert run("rig", "init", "hart.toml", "--from", "daten.csv", "--input", "Kraft", "--output", "Weg")[0] == 0
     rig = Rig.from_file("hart.toml")
     assert (rig.input.column, rig.output.column, rig.output.unit) == ("Kraft", "Weg", "m")

@@ -197,7 +197,7 @@ def test_bad_arguments_are_refused_with_a_remedy():
         (
             Difference(),
             {"prior": rig_prior(replace(VOLTS, step=1.0, guess=GUESS))},
-            "prior must have the rig's scales, limit and range, but has ",
+            "prior must have the scales of the rig, but was saved with step ",
         ),
         (Difference(), {"prior": None}, "rig must have guess to be played, but has none"),
     ]

@@ -1,6 +1,7 @@
 """Records as users have them: arrays, CSV and MAT files; what is cut, and what is refused."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tables import table
 
 from estimator import Channel, Rig, identify
 from estimator.identification.data import record_reader
+from estimator.identification.data.column_choice import choose_columns
 from estimator.identification.data.record_cleaning import find_clipped_outputs
 from estimator.identification.data.record_reader import read_records
 
@@ -41,6 +43,71 @@ def test_a_short_piece_between_missing_inputs_is_left_out():
         ("record 0", 200),
         ("record 0, from sample 206", 194),
     ]
+
+
+@table(
+    ("heading", "input_name", "output_name", "reason"),
+    [
+        ("Zeit;Geschwindigkeit [mm/s];Spannung [V]", "Spannung [V]", "Geschwindigkeit [mm/s]", "unit"),
+        ("t;accel [g];shaker force [N]", "shaker force [N]", "accel [g]", "name"),
+        ("t;Beschleunigung [g];Kraft [N]", "Kraft [N]", "Beschleunigung [g]", "name"),
+        ("Weg [µm];Kraft [mN]", "Kraft [mN]", "Weg [µm]", "name"),
+        ("Temps;Déplacement;Entrée", "Entrée", "Déplacement", "name"),
+        ("Tiempo;aceleración;fuerza", "fuerza", "aceleración", "name"),
+        ("tempo;spostamento;forza", "forza", "spostamento", "name"),
+        ("tijd;snelheid;kracht", "kracht", "snelheid", "name"),
+        ("Ausgangsspannung [V];Anregungskraft", "Anregungskraft", "Ausgangsspannung [V]", "name"),
+        ("t;CH1 [mm];CH2 [V]", "CH2 [V]", "CH1 [mm]", "unit"),
+        ("t;CH1 [V];CH2 [N]", "CH2 [N]", "CH1 [V]", "unit"),
+        ("t;CH1 [V];CH2 [°C];CH3 [m/s²]", "CH1 [V]", "CH3 [m/s²]", "unit"),
+        ("t;x force [N];x disp [m]", "x force [N]", "x disp [m]", "unit"),
+        ("t;input base acc [m/s2];acc mass [m/s2]", "input base acc [m/s2]", "acc mass [m/s2]", "name"),
+        ("t;Channel A (V);Channel B (mV)", "Channel A (V)", "Channel B (mV)", "order"),
+        ("t;CH1;CH2", "CH1", "CH2", "order"),
+        ("X_Value;Force;Laser", "Force", "Laser", "name"),
+        ("t;CH1 [mm]", None, "CH1 [mm]", "unit"),
+    ],
+)
+def test_columns_are_chosen_by_names_then_units_then_order(heading, input_name, output_name, reason):
+    names = heading.split(";")
+    choice = choose_columns(Path("r.csv"), names, len(names), None, None)
+    assert (None if choice.input is None else names[choice.input]) == input_name
+    assert (names[choice.output], choice.reason) == (output_name, reason)
+
+
+@table(
+    ("heading", "first", "second"),
+    [
+        ("t;displacement [N];force [m]", "'force [m]' is the input", "'displacement [N]' the output"),
+        ("t;x [N];CH2 [mm]", "'CH2 [mm]' is the input", "'x [N]' the output"),
+        ("t;CH1 [N];CH2 [mN]", "'CH1 [N]' and 'CH2 [mN]'", "are both an input"),
+        ("t;CH1 [mm];CH2 [m/s]", "'CH1 [mm]' and 'CH2 [m/s]'", "are both an output"),
+    ],
+)
+def test_columns_whose_names_and_units_contradict_are_refused(heading, first, second):
+    names = heading.split(";")
+    with pytest.raises(ValueError, match="--input and --output of duffing-env rig init") as error:
+        choose_columns(Path("r.csv"), names, len(names), None, None)
+    assert first in str(error.value)
+    assert second in str(error.value)
+    choose_columns(Path("r.csv"), names, len(names), names[1], names[2])
+
+
+def test_a_column_that_is_named_in_part_is_proposed():
+    with pytest.raises(ValueError, match=r"--input or the rig's \[input\] names.*; write 'shaker force'"):
+        choose_columns(Path("r.csv"), ["t", "shaker force [N]", "accel [g]"], 3, "force", None)
+
+
+def test_an_input_in_place_of_the_output_is_asked_about(tmp_path):
+    rng = np.random.default_rng(0)
+    held, moving = np.repeat(rng.uniform(-1, 1, 32), 24), np.sin(np.arange(768) / 9) + rng.standard_normal(768)
+    rows = "\n".join(f"{a},{b}" for a, b in zip(held, moving, strict=True))
+    (tmp_path / "r.csv").write_text(f"laser,shaker\n{rows}")
+    rig = Rig(0.01, input=Channel(column="shaker"), output=Channel(column="laser"))
+    with pytest.raises(ValueError, match="must have at least 50 outputs in all, but have") as error:
+        read_records(tmp_path / "r.csv", rig)
+    assert re.search(r"of 768 outputs \d+ (are clipped|repeat)[\w ,]* and count as missing", str(error.value))
+    assert "name the columns if these are wrong: Input: shaker; output: laser, a displacement" in str(error.value)
 
 
 def test_files(tmp_path):
@@ -94,8 +161,8 @@ def test_columns_of_any_name_are_named_in_the_rig(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "r.csv", rig), [[5, 6], [1, 2]])
     assert Rig.from_dict(rig.to_dict()) == rig
     for text, message in (
-        ("u,y\n5,1\n", r"one column 'Kraft', which the rig's \[input\] names, but has \['u', 'y'\]"),
-        ("Kraft,Weg [mm],Weg [mm]\n5,1,2\n", r"one column 'Weg \[mm\]', which the rig's \[output\] names"),
+        ("u,y\n5,1\n", r"one column 'Kraft', which --input or the rig's \[input\] names, but has \['u', 'y'\]"),
+        ("Kraft,Weg [mm],Weg [mm]\n5,1,2\n", r"one column 'Weg \[mm\]', which --output or the rig's \[output\] names"),
         ("5,1\n6,2\n", "must name its columns, because the rig names them"),
     ):
         (tmp_path / "other.csv").write_text(text)
@@ -197,7 +264,7 @@ def test_errors_name_the_record(records, message):
         ("u [kV],y [mm/s]", "'u [kV]' must be in the rig's unit, N, but is in kV; convert the column"),
         ("force [N],velocity [counts]", "'velocity [counts]' must be in the rig's unit, mm/s, but is in counts"),
         ("force [N],displacement [mm/s]", "must be the rig's kind of output, velocity, but is called displacement"),
-        ("Kraft [N],Strom [A],v [mm/s]", "rename the input to u, input, force"),
+        ("CH1 [V],CH2 [A],v [mm/s]", "rename the input to u, input or force"),
     ],
 )
 def test_names_of_columns_that_contradict_the_rig_are_refused(tmp_path, names, message):

@@ -67,7 +67,7 @@ def test_an_accelerometer_that_is_sampled_after_the_input_switches():
     u, before = simulated(BENCH, kind="acceleration")
     after = before + np.diff(u, prepend=0.0) / BENCH[0]["m"]
     named = {one.name: one.message for one in identify(rig_of(BENCH, "acceleration"), (u, after)).warnings}
-    assert "or make outputs missing where the input switches" in named["interpolation"]
+    assert "write an empty cell in place of y where it switches, and keep 'zero_order'" in named["interpolation"]
     after[1:][u[1:] != u[:-1]] = np.nan
     result = identify(rig_of(BENCH, "acceleration"), (u, after))
     assert result.warnings == ()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from estimator.identification.data.column_choice import ColumnNames
 from estimator.identification.data.record import Record
 from estimator.identification.data.record_cleaning import mask_over_range
 from estimator.rigs.rig import Rig
@@ -71,22 +73,28 @@ def read_mat_records(path: Path, rig: Rig) -> list[Record]:
             f"{path} must hold the variables {names[0]} and {names[1]}, but lacks {' and '.join(sorted(lacking))}; "
             f"mend the names, there or as column = '...' in the rig's [input] and [output]"
         )
+    columns = ColumnNames(*names, "request" if rig.input.column and rig.output.column else "name")
     u, y = (np.asarray(held[name]) for name in names)
     if u.ndim <= 1 and y.ndim <= 1:
         first, second = (to_finite_series(f"{name} of {path}", held[name], allow_nan=True) for name in names)
-        return [mask_over_range(str(path), first, second)]
-    columns = max(one.shape[1] if one.ndim == 2 else 1 for one in (u, y))
-    if u.ndim > 2 or y.ndim > 2 or len(u) != len(y) or any(one.ndim == 2 and one.shape[1] != columns for one in (u, y)):
+        return [replace(mask_over_range(str(path), first, second), columns=columns)]
+    n_records = max(one.shape[1] if one.ndim == 2 else 1 for one in (u, y))
+    if (
+        u.ndim > 2
+        or y.ndim > 2
+        or len(u) != len(y)
+        or any(one.ndim == 2 and one.shape[1] != n_records for one in (u, y))
+    ):
         raise ValueError(
             f"{path} must hold {names[0]} and {names[1]} of shapes (T,) or (T, n), for n records, but holds {u.shape} "
             f"and {y.shape}; transpose or cut them"
         )
     found = []
-    for k in range(columns):
+    for k in range(n_records):
         name = f"{path}, column {k + 1}"
         pair = [one if one.ndim == 1 else one[:, k] for one in (u, y)]
         first, second = (
             to_finite_series(f"{n} of {name}", one, allow_nan=True) for n, one in zip(names, pair, strict=True)
         )
-        found.append(mask_over_range(name, first, second))
+        found.append(replace(mask_over_range(name, first, second), columns=columns))
     return found

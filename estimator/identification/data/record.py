@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from estimator.identification.data.column_choice import ColumnNames
 from estimator.support.array_types import FloatArray
 
 
@@ -25,6 +26,7 @@ class Record:
         samples_per_value: samples for which a sensor repeats each output; 1 without repetition.
         times: (T,) times of the samples [s]; None where they are the rig's step apart.
         step: usual step of its own times [s]; None without times.
+        columns: names of its columns of input and output; None of arrays.
         is_over_range: (T,) whether an output is over range, before the record is cut.
     """
 
@@ -38,6 +40,7 @@ class Record:
     samples_per_value: int = 1
     times: FloatArray | None = None
     step: float | None = None
+    columns: ColumnNames | None = None
     is_over_range: npt.NDArray[np.bool_] | None = field(default=None, repr=False)
 
     def times_in_steps(self, step: float) -> FloatArray:

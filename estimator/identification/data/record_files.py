@@ -41,4 +41,4 @@ def _read_text(path: Path, rig: Rig) -> Record:
     record = mask_over_range(
         str(path), *table.signals_in_rig_units(rig.input, rig.output), table.times(rig.step), rig.step
     )
-    return replace(record, step=table.step())
+    return replace(record, step=table.step(), columns=table.column_names())

@@ -62,7 +62,7 @@ def read_records(source: Any, rig: Rig) -> list[Record]:
     _check_steps(whole_records, rig.step)
     count = sum(int(np.isfinite(one.y).sum()) for one in pieces)
     if count < _MIN_OUTPUTS:
-        raise ValueError(f"records must have at least {_MIN_OUTPUTS} outputs in all, but have {count}; add samples")
+        raise ValueError(_too_few_outputs_message(whole_records, pieces, count, rig))
     _check_overlap(pieces)
     if all(np.ptp(observed) == 0 for one in pieces if len(observed := one.y[np.isfinite(one.y)])):
         raise ValueError("y must vary, but is constant in all records; excite the system")
@@ -122,6 +122,19 @@ def _check_steps(records: Sequence[Record], step: float) -> None:
         raise ValueError(
             f"{records[0].name}: times are {steps[0]:.6g} s apart, but the step is {step:.6g} s; mend one of them"
         )
+
+
+def _too_few_outputs_message(records: Sequence[Record], pieces: Sequence[Record], count: int, rig: Rig) -> str:
+    """What is missing in records with too few outputs, and why: repeated values are typical of an input."""
+    message = f"records must have at least {_MIN_OUTPUTS} outputs in all, but have {count}"
+    facts = ("are empty", "n_missing"), ("are clipped", "n_clipped"), ("repeat the output before", "n_stale")
+    causes = [f"{n} {verb}" for verb, field in facts if (n := sum(getattr(one, field) for one in pieces))]
+    sentences = list(dict.fromkeys(one.columns.sentence(rig.output.kind) for one in records if one.columns))
+    if not causes:
+        return f"{message}; add samples"
+    total = sum(len(one.y) for one in records)
+    question = f", or name the columns if these are wrong: {sentences[0]}" if sentences else ""
+    return f"{message}: of {total} outputs {', '.join(causes)} and count as missing; add samples{question}"
 
 
 def _check_overlap(pieces: Sequence[Record]) -> None:

@@ -1,4 +1,4 @@
-"""Text tables of instruments, such as CSV files: columns of time, input and output, found by their names."""
+"""Text tables of instruments, such as CSV files: columns of time, input and output, found by names and units."""
 
 from __future__ import annotations
 
@@ -9,15 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from estimator.identification.data.column_names import (
-    WORDS_OF_SENSOR_KIND,
-    append_unit,
-    first_word,
-    is_input_or_output,
-    locate_columns,
-    seconds_per_time_unit,
-    unit_in_name,
-)
+from estimator.identification.data.column_choice import ColumnNames, choose_columns
+from estimator.identification.data.column_names import append_unit, seconds_per_time_unit, unit_in_name
+from estimator.identification.data.column_words import sensor_kind_in_name
 from estimator.identification.data.table_rows import (
     TableValue,
     find_first_row,
@@ -58,6 +52,7 @@ class TextTable:
         time_column: index of the time's column; None without one.
         input_column: index of the input's column; None in a free decay.
         output_column: index of the output's column.
+        reason: what decided which column is what (`estimator.identification.data.column_choice.ColumnChoice`).
         has_timestamps: whether the times were dates or times of day, and are seconds from the first on.
     """
 
@@ -68,6 +63,7 @@ class TextTable:
     time_column: int | None
     input_column: int | None
     output_column: int
+    reason: str
     has_timestamps: bool = False
 
     @property
@@ -162,9 +158,13 @@ class TextTable:
         """The unit in the name of a column, such as N in ``force [N]``; None without one."""
         return unit_in_name(self.names[column]) if self.names else None
 
-    def has_known_name(self, column: int) -> bool:
-        """Whether the name of a column is usual for an input or output; True where the table has no names."""
-        return not self.names or is_input_or_output(self.names[column])
+    def column_names(self) -> ColumnNames:
+        """The names of the columns of input and output; their places in a table without names."""
+        input_name, output_name = (
+            None if k is None else self.names[k] if self.names else f"column {k + 1}"
+            for k in (self.input_column, self.output_column)
+        )
+        return ColumnNames(input_name, str(output_name), self.reason)
 
     def output_kind(self) -> str | None:
         """The kind of the output by its name, or else by its unit; None where neither decides.
@@ -172,12 +172,8 @@ class TextTable:
         Raises:
             ValueError: where name and unit contradict each other.
         """
-        word, unit = (
-            first_word(self.names[self.output_column]) if self.names else "",
-            self.unit(self.output_column) or "",
-        )
-        named = next((kind for kind, words in WORDS_OF_SENSOR_KIND.items() if word in words), None)
-        measured = sensor_kind_of_unit(unit)
+        named = sensor_kind_in_name(self.names[self.output_column]) if self.names else None
+        measured = sensor_kind_of_unit(self.unit(self.output_column) or "")
         if named and measured and named != measured:
             raise ValueError(
                 f"{self.path}: the unit of {self.names[self.output_column]!r:.60} must fit its name, a {named}, but is "
@@ -192,10 +188,8 @@ class TextTable:
             ValueError: naming the column, for a unit of another quantity, or another kind of output. A channel that is
                 a pure number, 1, takes any unit.
         """
-        word = first_word(self.names[self.output_column]) if self.names else ""
-        kind = next(
-            (one for one, words in WORDS_OF_SENSOR_KIND.items() if word in words and len(word) > 1), output_channel.kind
-        )
+        named = sensor_kind_in_name(self.names[self.output_column], min_letters=2) if self.names else None
+        kind = named or output_channel.kind
         if kind != output_channel.kind:
             raise ValueError(
                 f"{self.path}: {self.names[self.output_column]!r:.60} must be the rig's kind of output, "
@@ -228,6 +222,7 @@ def read_table(path: Path, input_name: str | None = None, output_name: str | Non
     ``u,y``, ``time [ms],force [N],x [mm]`` or ``time_ms,force_N,x_mm``; or a line of names stands above a line of
     units, such as ``ms,N,mm``. Lines above these are skipped. Numbers without names are the columns u and y, or time in
     seconds, u and y. A column in a unit of time, or of dates or times of day, is the time, whatever its name.
+    `estimator.identification.data.column_choice.choose_columns` says which column is what.
 
     Args:
         path: the file.
@@ -256,5 +251,8 @@ def read_table(path: Path, input_name: str | None = None, output_name: str | Non
         rows = parse_rows(path, fields[first:], line_numbers[first:], separator)
     columns, stamped = timestamps_to_seconds(path, rows, line_numbers[first:], names)
     names = tuple(append_unit(path, name, unit) for name, unit in zip(names, units, strict=True)) if units else names
-    places = locate_columns(path, names, len(columns), input_name, output_name, stamped)
-    return TextTable(path, names, columns, np.array(line_numbers[first:]), *places, places.time in stamped)
+    choice = choose_columns(path, names, len(columns), input_name, output_name, stamped)
+    return TextTable(
+        path, names, columns, np.array(line_numbers[first:]), choice.time, choice.input, choice.output, choice.reason,
+        choice.time in stamped,
+    )  # fmt: skip

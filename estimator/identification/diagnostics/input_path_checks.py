@@ -167,13 +167,17 @@ def _input_path_finding(problem: IdentificationProblem, alternative: FitHypothes
     rig = problem.rig
     name = "interpolation" if alternative.interpolation != rig.interpolation else "delay"
     lag = f", and a lag of {alternative.lag * rig.step:.3g} s" if alternative.lag else ""
-    into = f"write these into the rig{', the lag into its [input]' if lag else ''}, and identify again"
-    message = (
+    evidence = (
         f"the records speak for interpolation '{alternative.interpolation}' with delay {alternative.delay:g}{lag}, by "
-        f"{gain:.0f} nats, and not for '{rig.interpolation}' with delay {rig.delay:g}; {into}"
+        f"{gain:.0f} nats ({MIN_EVIDENCE:g} are decisive), and not for '{rig.interpolation}' with delay {rig.delay:g}"
     )
+    remedy = f"write these into the rig{', the lag into its [input]' if lag else ''}, and identify again"
     if rig.output.kind == "acceleration" and (rig.interpolation, alternative.interpolation) == ("zero_order", "linear"):
-        message += "; or make outputs missing where the input switches, if y shows it just after that"
+        remedy = (
+            f"if y shows the acceleration just after the input switches, write an empty cell in place of y where it "
+            f"switches, and keep '{rig.interpolation}'; if the input is not held, {remedy}"
+        )
+    message = f"{evidence}; {remedy}"
     return CheckFinding("lag" if alternative.lag and name == "delay" else name, message)
 
 

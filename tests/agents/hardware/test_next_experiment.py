@@ -143,9 +143,12 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
             ["design", "rig.toml", "-o", "a.png", "--figure", "./a.png"],
             "figure must be .* and so is output; name another",
         ),
-        (["design", "rig.toml", "-o", "timed.csv"], "output must be a new file, but there is timed.csv; name another"),
-        (["design", "rig.toml", "--figure", "timed.csv"], "figure must be a new file, but there is timed.csv"),
-        (["export", "prbs", "-o", "timed.csv"], "output must be a new file, but there is timed.csv; name another"),
+        (
+            ["design", "rig.toml", "-o", "timed.csv"],
+            "-o/--output must be a new file, but there is timed.csv; name another",
+        ),
+        (["design", "rig.toml", "--figure", "timed.csv"], "--figure must be a new file, but there is timed.csv"),
+        (["export", "prbs", "-o", "timed.csv"], "-o/--output must be a new file, but there is timed.csv; name another"),
         (["design", "rig.toml", "--figure", "a.pdf"], "figure must be a PNG file, but is a.pdf"),
         (["design", "rig.toml", "--policy", "efe-block-16"], "policy must be 'efe' here, but is 'efe-block-16'"),
         (
