@@ -148,8 +148,8 @@ def check_asymmetry(problem: IdentificationProblem, belief: Belief) -> list[Chec
         f"{_format_with_std(*equilibrium.stiffness)} {stiffness} and its quadratic stiffness "
         f"{_format_with_std(*equilibrium.quadratic)} {square}; a and b hold at its inflection, which is "
         f"{distance:.3g} {scales.unit((0, 1, 0))} away{far}. "
-        f"This is a note, and the intervals hold: a preload u0 has this effect, as has a quadratic spring; use the "
-        f"stiffness at rest for small motions"
+        f"This is a note, and alone leaves the intervals valid: a preload u0 has this effect, as has a quadratic "
+        f"spring; use the stiffness at rest for small motions"
     )
     return [CheckFinding("asymmetric", message)]
 
