@@ -65,6 +65,7 @@ def test_a_short_piece_between_missing_inputs_is_left_out():
         ("t;Channel A (V);Channel B (mV)", "Channel A (V)", "Channel B (mV)", "order"),
         ("t;CH1;CH2", "CH1", "CH2", "order"),
         ("X_Value;Force;Laser", "Force", "Laser", "name"),
+        ("sample;time;u;y;commanded;late_output", "u", "y", "name"),
         ("t;CH1 [mm]", None, "CH1 [mm]", "unit"),
     ],
 )

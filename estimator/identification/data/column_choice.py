@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from estimator.identification.data.column_names import SECONDS_OF_TIME_UNIT, name_without_unit, unit_in_name
-from estimator.identification.data.column_words import role_in_name
+from estimator.identification.data.column_words import first_word, role_in_name
 from estimator.rigs.units import normalise_unit, to_si_unit
 
 #: Quantity to the SI units that show it, in their normalised spelling.
@@ -119,7 +119,7 @@ def choose_columns(
         )
     remaining = [k for k in range(len(names)) if [k] not in requested.values()]
     time = _find_times(names, remaining, timestamp_columns)
-    named = {role: [k for k in remaining if k not in time and role_in_name(names[k]) == role] for role in requested}
+    named = {role: _find_named(names, [k for k in remaining if k not in time], role) for role in requested}
     u, y = (requested[role] or named[role] for role in ("input", "output"))
     reason = "request" if all(requested.values()) else "name"
     time = time or [k for k in remaining if unit_in_name(names[k]) in SECONDS_OF_TIME_UNIT]
@@ -156,6 +156,13 @@ def _find_times(names: Sequence[str], remaining: Sequence[int], timestamp_column
     stamped = [k for k in remaining if k in timestamp_columns]
     stamped = stamped or [k for k in remaining if names[k].strip().lower() == "x_value"]
     return stamped or [k for k in remaining if role_in_name(names[k]) == "time"]
+
+
+def _find_named(names: Sequence[str], remaining: Sequence[int], role: str) -> list[int]:
+    """The columns whose names state a role; of several those whose first words do, such as y beside late_output."""
+    found = [k for k in remaining if role_in_name(names[k]) == role]
+    by_first_word = [k for k in found if role_in_name(first_word(names[k])) == role]
+    return by_first_word if len(found) > 1 and by_first_word else found
 
 
 def _choose_by_unit_or_order(
