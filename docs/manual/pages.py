@@ -18,7 +18,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from agents import POLICIES
-from agents.leaderboard import leaderboard_file
+from agents.leaderboard import leaderboard_file, leaderboard_tables
 from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS
 from duffing_env.rewards import reward_registry
@@ -36,7 +36,7 @@ REFERENCE = {
     "estimator": [f"estimator.{name}" for name in importlib.import_module("estimator").__all__],
     "duffing_env": [
         "duffing_env.vector_env.DuffingVectorEnv",
-        "duffing_env.vector_env.SilverboxReplayVectorEnv",
+        "duffing_env.tracks.silverbox_replay.SilverboxReplayVectorEnv",
         "duffing_env.env_base.ExperimentEnv",
         "duffing_env.custom_functions.Beliefs",
         "duffing_env.tracks.rig_plant_env.Plant",
@@ -48,7 +48,7 @@ REFERENCE = {
         "agents.training.train",
         "agents.training.resume",
         "agents.training.train_seeds",
-        "agents.training.tune",
+        "agents.training.tune_hyperparameters",
         "agents.training.PPOSettings",
         "agents.training.SACSettings",
         "agents.training.TD3Settings",
@@ -178,7 +178,8 @@ def _policies() -> str:
                 f"::: agents.policies.{name}\n"
                 for name in (
                     *("make_policy", "Policy", "signals.SignalPolicy"),
-                    *("learned.TrainedPolicy", "features", "features.FeatureEncoder"),
+                    *("networks.trained_policy.TrainedPolicy", "networks.feature_encoder"),
+                    "networks.feature_encoder.FeatureEncoder",
                 )
             ),
         ]
@@ -189,14 +190,14 @@ def _leaderboard() -> str:
     parts = [
         "# Leaderboard",
         "By the [protocol](protocol.md). `duffing-env report` prints it.",
-        leaderboard_file.LEADERBOARD_CAPTION,
+        leaderboard_tables.LEADERBOARD_CAPTION,
     ]
-    for track, rows in leaderboard_file.leaderboard_rows(
+    for track, rows in leaderboard_tables.leaderboard_rows(
         leaderboard_file.read_entries(leaderboard_file.SHIPPED_LEADERBOARD)
     ).items():
         lines = [
             f"| {' | '.join(row)} |"
-            for row in (leaderboard_file.COLUMN_TITLES, ["---"] * len(leaderboard_file.COLUMN_TITLES), *rows)
+            for row in (leaderboard_tables.COLUMN_TITLES, ["---"] * len(leaderboard_tables.COLUMN_TITLES), *rows)
         ]
         parts += [f"## {_title(track)}", "\n".join(lines)]
     return "\n\n".join(parts)
