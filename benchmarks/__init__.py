@@ -1,1 +1,1 @@
-"""Timed benchmarks: `python -m benchmarks`; ``docs/benchmarks.md`` describes them and has the last results."""
+"""Timed benchmarks: `python -m benchmarks`; ``docs/evidence/benchmarks.md`` describes them and has the last results."""

@@ -1,7 +1,7 @@
 """Coverage of credible intervals: how often the posterior's 90 % intervals contain the truth, over the prior's systems.
 
-``python -m benchmarks.interval_coverage`` prints the tables of docs/coverage.md, docs/continuous.md and
-docs/estimators.md.
+``python -m benchmarks.interval_coverage`` prints the tables of docs/evidence/coverage.md, continuous.md and
+expectations.md.
 """
 
 import dataclasses

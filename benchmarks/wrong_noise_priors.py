@@ -1,8 +1,8 @@
 """The cost of wrong noise priors, in coverage and in nats.
 
-``python -m benchmarks.wrong_noise_priors`` prints tables of docs/coverage.md. The priors of both noises are centred at
-multiples of the truth. Systems, noises and inputs are the same in every row, also for an estimator with the true
-noises.
+``python -m benchmarks.wrong_noise_priors`` prints tables of docs/evidence/coverage.md. The priors of both noises are
+centred at multiples of the truth. Systems, noises and inputs are the same in every row, also for an estimator with the
+true noises.
 """
 
 from dataclasses import dataclass

@@ -159,7 +159,8 @@ def weak_prior(
             noise.
         measurement_noise: standard deviation at which ξ is centred: one number, or one for each sensor.
         noise_shape: shape of the Gamma priors: 2 is the information of four observed noises. Noises are never observed
-            alone, so that even such a prior binds for thousands of samples (docs/coverage.md): centre it with care.
+            alone, so that even such a prior binds for thousands of samples (docs/evidence/coverage.md): centre it with
+            care.
         state_std: standard deviation of the states about 0: one number, or one for each.
         scales: units of the parameters.
 

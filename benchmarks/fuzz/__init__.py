@@ -1,1 +1,1 @@
-"""Fuzzing with thousands of bad inputs: ``python -m benchmarks.fuzz``; docs/reliability.md has the last table."""
+"""Fuzzing with thousands of bad inputs: ``python -m benchmarks.fuzz``; table in docs/evidence/reliability.md."""

@@ -38,7 +38,7 @@ REFERENCE = {
         "duffing_env.vector_env.DuffingVectorEnv",
         "duffing_env.tracks.silverbox_replay.SilverboxReplayVectorEnv",
         "duffing_env.env_base.ExperimentEnv",
-        "duffing_env.custom_functions.Beliefs",
+        "duffing_env.belief_arrays.Beliefs",
         "duffing_env.tracks.rig_plant_env.Plant",
         "duffing_env.plants.silverbox_record.load_record",
         "duffing_env.plants.silverbox_record.regime_input",
@@ -178,7 +178,7 @@ def _policies() -> str:
                 f"::: agents.policies.{name}\n"
                 for name in (
                     *("make_policy", "Policy", "signals.SignalPolicy"),
-                    *("networks.trained_policy.TrainedPolicy", "networks.feature_encoder"),
+                    *("networks.trained_policy.TrainedPolicy", "networks.rollout_features"),
                     "networks.feature_encoder.FeatureEncoder",
                 )
             ),

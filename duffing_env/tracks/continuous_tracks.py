@@ -63,7 +63,7 @@ class ContinuousEnv(DuffingEnv):
     integrates it with exact sensitivities, and updates a joint Gaussian posterior over (x, x', k, κ, d, g) with every
     sample; seven ratios of the noises at three levels each are weighed by their evidence (``noise_hypotheses``).
     ``estimator="nlarx"`` uses the paper's difference equation instead, which this plant does not obey: a foil that
-    shows the effect of misspecification (docs/continuous.md).
+    shows the effect of misspecification (docs/evidence/continuous.md).
 
     ## Action space, observation space
 

@@ -164,7 +164,7 @@ class ModelEnv(DuffingEnv):
     The estimator linearises the model. For a strongly nonlinear model its intervals are too narrow: on
     ``WienerHammerstein-v0`` the 90 % intervals contain the truth in 68 to 84 % of cases, under binary inputs at the
     limit. With ``noise_hypotheses`` above 1 it propagates sigma points, and they contain it in 87 to 90 %
-    (docs/coverage.md).
+    (docs/evidence/coverage.md).
 
     ## Information
 

@@ -41,7 +41,7 @@ class PEMNARX:
     Jacobian, on standardised regressors and outputs. Every restart begins at the least-squares linear model, with
     silent units (a = 0) of random direction and bias; the fit with the lowest training error is kept.
 
-    The fit is better than the published one, which is no minimum of the criterion (docs/reproduction.md).
+    The fit is better than the published one, which is no minimum of the criterion (docs/evidence/reproduction.md).
 
     Args:
         units: number K >= 0 of sigmoid units; with 0 the model is a linear ARX model with an offset.

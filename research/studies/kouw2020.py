@@ -2,7 +2,7 @@
 
 Every model is trained on the multisine part of the record, 90,972 samples, and validated on the arrow part, 40,100
 samples, with its parameters fixed: by one-step predictions from the measured outputs, and by a simulation, a free run
-from the first two of them. `reproduce` does it all; ``docs/reproduction.md`` discusses the outcome.
+from the first two of them. `reproduce` does it all; ``docs/evidence/reproduction.md`` discusses the outcome.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ amplitude exceeds the training's) it simulates the other outputs, and the root m
 setting may be chosen on test data: `research.studies.silverbox_results.compare_on_validation` compares settings on the
 last quarter of the training section.
 
-``docs/silverbox.md`` discusses the outcome.
+``docs/evidence/silverbox.md`` discusses the outcome.
 """
 
 from __future__ import annotations
