@@ -30,7 +30,7 @@ def rich_console() -> Console:
     return made
 
 
-def print_wrapped(text: str, file: TextIO | None = None) -> None:
+def print_in_80_columns(text: str, file: TextIO | None = None) -> None:
     """Print a text in lines of at most `MAX_LINE_WIDTH` characters; a longer word, such as a path, is not broken."""
     for line in mask_control_codes(text, "\n").split("\n"):
         whole = textwrap.wrap(line, MAX_LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
@@ -39,14 +39,14 @@ def print_wrapped(text: str, file: TextIO | None = None) -> None:
 
 def print_warning(text: str) -> None:
     """Print a warning on stderr."""
-    print_wrapped(f"duffing-env: warning: {text}", sys.stderr)
+    print_in_80_columns(f"duffing-env: warning: {text}", sys.stderr)
 
 
 def print_texts_and_tables(*parts: str | list[Table]) -> None:
-    """Print texts (`print_wrapped`) and tables (`format_table`)."""
+    """Print texts (`print_in_80_columns`) and tables (`format_table`)."""
     for part in parts:
         if isinstance(part, str):
-            print_wrapped(part)
+            print_in_80_columns(part)
         else:
             for k, one_table in enumerate(part):
                 if k:

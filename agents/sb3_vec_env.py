@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from duffing_env.env_base import ReadOnlyOption, check_reset_options
+from duffing_env.env_common import ReadOnlyOption, check_reset_options
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.models.named_parameters import Parameters
 from estimator.support.optional_dependencies import require_packages

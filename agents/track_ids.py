@@ -37,7 +37,7 @@ def full_track_id(env_id: Any) -> Any:
     return f"duffing_env/{env_id}" if f"duffing_env/{env_id}" in TRACKS else env_id
 
 
-def check_track_id(env_id: str) -> None:
+def check_is_duffing_track(env_id: str) -> None:
     """Refuse an id that is no track: training and evaluation need a vector environment of duffing_env.
 
     Raises:

@@ -16,7 +16,7 @@ from scipy.stats import binomtest, norm
 from agents.console_output import format_table, print_texts_and_tables
 from agents.result_files import write_json
 from benchmarks.random_systems import SPREAD, draw, make_model, make_prior, make_rig, names_of
-from duffing_env.tracks.continuous_tracks import ContinuousVectorEnv
+from duffing_env.tracks.differential_equation_tracks import ContinuousVectorEnv
 from estimator import OnlineEstimator, coefficients_of, duffing
 from estimator.belief import Belief
 from estimator.support.array_types import FloatArray

@@ -27,7 +27,7 @@ COMPILED = (
     "tests/duffing_env/test_continuous_plant.py",
     "tests/duffing_env/test_kernel.py",
     "tests/duffing_env/test_noise.py",
-    "tests/duffing_env/test_rig_plant.py",
+    "tests/duffing_env/test_external_plant_env.py",
     "tests/duffing_env/test_plant.py",
     "tests/duffing_env/test_rewards.py",
     "tests/duffing_env/test_simulation.py",

@@ -3,8 +3,8 @@ from .batch import spawn_seeds
 from .belief_arrays import Beliefs
 from .env import DuffingEnv
 from .plants.silverbox_record import load_record
+from .tracks.external_plant_env import Plant
 from .tracks.model_env import ModelEnv
-from .tracks.rig_plant_env import Plant
 from .tracks.track_registry import TRACKS, register_tracks
 from .vector_env import DuffingVectorEnv
 

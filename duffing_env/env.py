@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
 from duffing_env.custom_functions import CustomFunctions
-from duffing_env.env_base import (
+from duffing_env.env_common import (
     ExperimentEnv,
     action_space,
     check_reset_options,

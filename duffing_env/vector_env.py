@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.custom_functions import CustomFunctions
 from duffing_env.env import DuffingEnv
-from duffing_env.env_base import (
+from duffing_env.env_common import (
     ExperimentEnv,
     ReadOnlyOption,
     action_space,

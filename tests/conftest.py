@@ -66,7 +66,7 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 #: Files whose kernels others compile, which begin when these are done.
-_LATE = ("test_rig_plant.py", "test_cli.py", "test_saving.py", "test_identification.py", "test_own_model.py")
+_LATE = ("test_external_plant_env.py", "test_cli.py", "test_saving.py", "test_identification.py", "test_own_model.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

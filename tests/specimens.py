@@ -15,7 +15,7 @@ import pytest
 from reference.plants import DRAG
 
 from duffing_env.env import DuffingEnv
-from duffing_env.tracks.continuous_tracks import ContinuousEnv, ContinuousVectorEnv
+from duffing_env.tracks.differential_equation_tracks import ContinuousEnv, ContinuousVectorEnv
 from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
 from duffing_env.tracks.rig_env import RigEnv, RigVectorEnv
 from duffing_env.tracks.silverbox_replay import SilverboxReplayEnv, SilverboxReplayVectorEnv

@@ -15,7 +15,7 @@ PACKAGES = ("estimator", "duffing_env", "agents", "research", "benchmarks")
 #: At the top of the repository; they may import all but the benchmarks.
 SCRIPTS = ("train", "evaluate", "reproduce")
 #: Modules of agents that are commands themselves, besides those in agents.commands.
-COMMAND_MODULES = ("agents.cli", "agents.datasets")
+COMMAND_MODULES = ("agents.cli", "agents.minari_datasets")
 
 
 def modules(root):

@@ -42,7 +42,7 @@ class DesignCommand:
 
     def run(self) -> None:
         """Design, print the expected intervals, and write the signal."""
-        from agents.console_output import print_wrapped
+        from agents.console_output import print_in_80_columns
         from agents.hardware.next_experiment import design_experiment
         from agents.output_paths import check_distinct_files, check_not_overwritten
         from estimator.saving import load_estimator
@@ -74,9 +74,9 @@ class DesignCommand:
         finally:
             print_experiment_design(experiment_design)
         if self.output is not None:
-            print_wrapped(f"The signal is {self.output}")
+            print_in_80_columns(f"The signal is {self.output}")
         if self.figure is not None:
-            print_wrapped(f"The picture is {self.figure}")
+            print_in_80_columns(f"The picture is {self.figure}")
 
 
 def print_experiment_design(design: ExperimentDesign) -> None:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from agents.json_options import JsonOptions
-from agents.track_ids import RIG_TRACK, check_track_id, full_track_id, options_with_rig
+from agents.track_ids import RIG_TRACK, check_is_duffing_track, full_track_id, options_with_rig
 
 #: Options that may be given with ``protocol``.
 _PROTOCOL_OPTIONS = ("policies", "protocol", "submit", "samples", "board")
@@ -54,7 +54,7 @@ class EvaluateCommand:
     def __post_init__(self) -> None:
         if self.rig is not None and self.env is not None and full_track_id(self.env) != RIG_TRACK:
             raise ValueError(f"env must be left out with rig, whose track is Rig-v0, but is {self.env}; leave one out")
-        check_track_id(self._track)
+        check_is_duffing_track(self._track)
         if self.protocol is not None and len(self.policies) != 1:
             raise ValueError(f"policies must name one for the protocol, but are {list(self.policies)}; name one")
         if self.protocol is None and self.submit is not None:
@@ -87,7 +87,7 @@ class EvaluateCommand:
         )  # fmt: skip
 
     def _run_protocol(self, protocol: str) -> None:
-        from agents.console_output import format_table, print_texts_and_tables, print_wrapped
+        from agents.console_output import format_table, print_in_80_columns, print_texts_and_tables
         from agents.leaderboard.leaderboard_file import append_entry, check_new_entry
         from agents.leaderboard.leaderboard_tables import COLUMN_TITLES, LEADERBOARD_CAPTION, entry_cells
         from agents.leaderboard.protocol import measure_policy
@@ -107,8 +107,8 @@ class EvaluateCommand:
         finally:
             print_texts_and_tables(track, format_table(COLUMN_TITLES, [entry_cells(entry)]), LEADERBOARD_CAPTION)
         if self.submit is not None:
-            print_wrapped(f"{self.submit} is on the board {self.board}: duffing-env report")
+            print_in_80_columns(f"{self.submit} is on the board {self.board}: duffing-env report")
             if track in tracks_with_name:
-                print_wrapped(
+                print_in_80_columns(
                     f"The board had {self.submit} on {track} before; the report shows the latest entry of a name."
                 )

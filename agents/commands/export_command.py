@@ -39,7 +39,7 @@ class ExportCommand:
         """Write the file, and print a summary."""
         import numpy as np
 
-        from agents.console_output import print_wrapped
+        from agents.console_output import print_in_80_columns
         from agents.output_paths import check_not_overwritten
         from agents.policies.signal_export import export_signal
         from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
@@ -52,10 +52,10 @@ class ExportCommand:
         volts = export_signal(self.name, self.output, **limits)
         peak, rms = np.abs(volts).max(), np.sqrt(np.mean(volts**2))
         seconds = volts.size * SILVERBOX_SAMPLING_STEP
-        print_wrapped(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")
+        print_in_80_columns(f"{self.output}: {volts.size} samples, {seconds:.4g} s, peak {peak:.4g} V, RMS {rms:.4g} V")
 
     def _export_network(self) -> None:
-        from agents.console_output import print_wrapped
+        from agents.console_output import print_in_80_columns
         from agents.policies import TRAINED, trained_policies
         from agents.policies.networks.onnx_export import export_network
         from agents.policies.networks.trained_policy import load_policy
@@ -63,4 +63,6 @@ class ExportCommand:
         policy = load_policy(TRAINED / self.name if self.name in trained_policies() else self.name)
         export_network(policy, self.output)
         sizes = " to ".join(str(size) for size in (policy.layers[0][0].shape[1], *(len(b) for _, b in policy.layers)))
-        print_wrapped(f"{self.output}: {len(policy.layers)} layers, {sizes} numbers; the shield is not in the file")
+        print_in_80_columns(
+            f"{self.output}: {len(policy.layers)} layers, {sizes} numbers; the shield is not in the file"
+        )

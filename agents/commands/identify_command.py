@@ -40,7 +40,7 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Identify, print, and write the files."""
-        from agents.console_output import print_wrapped
+        from agents.console_output import print_in_80_columns
         from agents.output_paths import check_distinct_files
         from estimator import identify
 
@@ -66,7 +66,7 @@ class IdentifyCommand:
             else:
                 print_identification(result)
         if self.report is not None and not self.json:
-            print_wrapped(f"The page is {self.report}")
+            print_in_80_columns(f"The page is {self.report}")
 
 
 def result_to_dict(result: Result) -> dict[str, Any]:

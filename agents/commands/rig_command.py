@@ -38,7 +38,7 @@ class RigInitCommand:
     def run(self) -> None:
         """Write the file."""
         from agents.commands.rig_file_builder import ask_for_rig, rig_text_from_record
-        from agents.console_output import print_wrapped
+        from agents.console_output import print_in_80_columns
         from agents.output_paths import check_not_overwritten
         from estimator.rigs.rig import SHIPPED_RIGS
         from estimator.support.file_io import write_atomically
@@ -56,10 +56,10 @@ class RigInitCommand:
             text, summary = rig_text_from_record(Path(self.source), self.step, self.input, self.output)
         write_atomically(self.path, text)
         if summary:
-            print_wrapped(summary)
-        print_wrapped(f"Wrote {self.path}: read it, and correct what is wrong.")
+            print_in_80_columns(summary)
+        print_in_80_columns(f"Wrote {self.path}: read it, and correct what is wrong.")
         data = "data.csv" if self.source is None or self.source in SHIPPED_RIGS else self.source
-        print_wrapped(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
+        print_in_80_columns(f"Next: {shlex.join(['duffing-env', 'identify', str(self.path), str(data)])}")
 
 
 @dataclass(frozen=True)

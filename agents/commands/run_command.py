@@ -41,7 +41,7 @@ class RunCommand:
 
     def run(self) -> None:
         """Run, and print the parameters; the exit status is `RunResult.exit_status`."""
-        from agents.console_output import print_warning, print_wrapped
+        from agents.console_output import print_in_80_columns, print_warning
         from agents.hardware.experiment_run import NOT_ZEROED, run_experiment
         from agents.hardware.plant_interface import load_plant
         from estimator import Rig
@@ -60,9 +60,9 @@ class RunCommand:
                 plant.close()
         print_run_result(result)
         if result.outcome == NOT_ZEROED:
-            print_wrapped(f"duffing-env: complete, but {result.message}", sys.stderr)
+            print_in_80_columns(f"duffing-env: complete, but {result.message}", sys.stderr)
         elif result.exit_status:
-            print_wrapped(f"duffing-env: ended early ({result.outcome}): {result.message}", sys.stderr)
+            print_in_80_columns(f"duffing-env: ended early ({result.outcome}): {result.message}", sys.stderr)
         elif result.message:
             print_warning(result.message)
         sys.exit(result.exit_status)

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from agents.cli import one_line_errors, parse_arguments
-from agents.console_output import print_warning, print_wrapped
+from agents.console_output import print_in_80_columns, print_warning
 from agents.interruption import add_resume_hint
 from agents.training import ALGORITHMS, TrainConfig, TrainingSubject, resume, train, train_seeds, tune_hyperparameters
 from agents.training.environments.oscillator_family import FAMILY
@@ -67,7 +67,7 @@ class TrainCommand(TrainConfig):
         """Train or search, compare, and print where the files are."""
         each = self.hyperparameters.samples_per_update
         if self.resume is None and self.samples > self.steps:
-            print_wrapped(
+            print_in_80_columns(
                 f"An update takes {each:,} samples, so {self.samples:,} will be learned from, not {self.steps:,}."
             )
         if self.resume is None and (updates := self.samples // each) < _MIN_UPDATES:
@@ -76,16 +76,16 @@ class TrainCommand(TrainConfig):
         if self.tune:
             with add_resume_hint(lambda hint: _REPEAT_COMMAND_HINT):
                 best = tune_hyperparameters(self, self.tune, on_ray=self.ray)
-            print_wrapped(f"The best hyperparameters are in {best}")
+            print_in_80_columns(f"The best hyperparameters are in {best}")
             quoted_path = shlex.quote(str(best))
-            print_wrapped(
+            print_in_80_columns(
                 f"To train with them: the same command, with --settings {quoted_path} in place of --tune and --output"
             )
             return
         if self.seeds > 1:
             with add_resume_hint(lambda hint: _REPEAT_COMMAND_HINT):
                 for folder in train_seeds(self, self.seeds, on_ray=self.ray):
-                    print_wrapped(f"The run is in {folder}")
+                    print_in_80_columns(f"The run is in {folder}")
                     sys.stdout.flush()
             self._compare(f"{self.algo}={folder.parent}/[0-9]*", self, folder.parent)
             return
@@ -95,18 +95,18 @@ class TrainCommand(TrainConfig):
             if asdict(replace(self, resume=None, systems=TrainCommand.systems)) != asdict(TrainCommand()):
                 raise ValueError("resume takes all settings but systems from the run; leave out the others")
             run = resume(self.resume)
-        print_wrapped(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
+        print_in_80_columns(f"Trained in {run.seconds:.0f} s, compilation included. The run is in {run.folder}")
         self._compare(str(run.folder), run.config, run.folder)
         if (picture := run.folder / LEARNING_CURVE_FILE).exists():
-            print_wrapped(str(picture))
+            print_in_80_columns(str(picture))
         else:
-            print_wrapped("No episode ended, so there is no learning curve; take more steps.")
+            print_in_80_columns("No episode ended, so there is no learning curve; take more steps.")
 
     def _compare(self, policy: str, config: TrainConfig, folder: Path) -> None:
         """Compare what was trained with the default policies of the track."""
         if config.env == FAMILY:
             module = "research.studies.unseen_oscillators"
-            print_wrapped(f"From a checkout of the repository: python -m {module} --policies {policy}")
+            print_in_80_columns(f"From a checkout of the repository: python -m {module} --policies {policy}")
         elif self.systems:
             from agents.evaluation.comparison import compare_policies, default_policies
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.console_output import print_wrapped
+from agents.console_output import print_in_80_columns
 from agents.evaluation.comparison_tables import (
     ComparisonSettings,
     print_comparison_table,
@@ -89,11 +89,13 @@ def compare_policies(
         print_comparison_table(evaluations, title)
         print_estimator_table(evaluations)
     if not headline_only and not record_available() and env_id != RIG_TRACK and "error_m" in evaluations[0].metrics:
-        print_wrapped("Metrics by the Silverbox record are left out: the Silverbox record is not on this machine.")
+        print_in_80_columns(
+            "Metrics by the Silverbox record are left out: the Silverbox record is not on this machine."
+        )
     if not figures:
-        print_wrapped(f"Figures are left out: {install_hint('matplotlib')}")
+        print_in_80_columns(f"Figures are left out: {install_hint('matplotlib')}")
     for name in ("evaluation.json", *figures):
-        print_wrapped(str(folder / name))
+        print_in_80_columns(str(folder / name))
     return evaluations
 
 

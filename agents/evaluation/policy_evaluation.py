@@ -10,11 +10,7 @@ import numpy as np
 
 from agents.evaluation import metrics
 from agents.evaluation.estimator_comparison import estimate_with_other_estimators
-from agents.evaluation.policy_groups import (
-    check_policies_can_play,
-    policy_group,
-    policy_title,
-)
+from agents.evaluation.policy_arguments import check_policies_can_play, policy_group, policy_title
 from agents.evaluation.policy_rollout import Evaluation, PolicySpec, run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
 from duffing_env.experiment_config import SimulatedExperiment

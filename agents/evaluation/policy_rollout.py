@@ -10,10 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.evaluation import metrics
-from agents.evaluation.policy_groups import (
-    check_predict_signature,
-    policy_title,
-)
+from agents.evaluation.policy_arguments import check_predict_signature, policy_title
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import Policy, make_policy
 from agents.user_code import attribute_user_errors

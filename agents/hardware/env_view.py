@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.storage.kernel_spec import observation_bounds
-from duffing_env.tracks.rig_plant_env import RigPlantExperiment
+from duffing_env.tracks.external_plant_env import RigPlantExperiment
 from estimator.belief import Belief
 from estimator.inference.free_run import output_at
 from estimator.rigs.rig import Rig

@@ -10,12 +10,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from agents.planning.model_probe import believed_resonance, local_dynamics
+from agents.planning.model_probe import believed_resonance, probe_dynamics
 from agents.planning.open_loop.posterior_samples import SystemDraws, draw_from_estimator
 from estimator.belief import Belief, covariance_indices
 from estimator.compilation.array_operations import copy as copy_numbers
 from estimator.compilation.simd import kernel
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 from estimator.identification.fitting.posterior_belief import refit_coefficients
 from estimator.models.model import Model
 from estimator.online import OnlineEstimator
@@ -55,7 +55,7 @@ class _FreeResponse(Protocol):
 @cache
 def _compile_free_response(model: Model) -> _FreeResponse:
     """The compiled free response of a model."""
-    kernels = compile_noise_free_response(model)
+    kernels = compile_noise_free_step(model)
     layout, step, n = kernels.layout, kernels.step, model.n_states
     size, n_variables, input_index = len(layout), len(model.names), layout["INPUT"]
 
@@ -222,7 +222,7 @@ class RunEstimator:
             systems, u / self.online.scales.input, rng.integers(max_pause, size=len(systems))
         )
         states = systems[:, :n]
-        outputs = local_dynamics(self.online.model, systems[:, n:], states).outputs_shown
+        outputs = probe_dynamics(self.online.model, systems[:, n:], states).outputs_shown
         kept = states[(np.abs(outputs) < _DIVERGED_OUTPUT) & np.isfinite(states).all(axis=1)]
         if len(kept) < len(states) / 2:
             raise ValueError(

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from agents.hardware.plant_interface import HardwarePlant
 from agents.hardware.recording import EventLog
 from agents.interruption import InterruptHandler
-from duffing_env.tracks.rig_plant_env import as_number
+from duffing_env.tracks.external_plant_env import as_number
 from estimator.rigs.rig import Rig
 from estimator.support.argument_checks import short_repr
 from estimator.support.array_types import FloatArray

@@ -17,7 +17,7 @@ import numpy as np
 from agents.evaluation.metric_summary import IQM, METRIC_COLUMNS, MetricColumn, MetricSummary, center_and_interval
 from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.oracle import Oracle, TrackSystems
-from agents.evaluation.policy_groups import policy_group
+from agents.evaluation.policy_arguments import policy_group
 from agents.evaluation.policy_rollout import Evaluation, run_episodes
 from agents.evaluation.track_batch import TEST_OPTIONS
 from agents.policies import TRAINED, trained_policies

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.planning.candidate_inputs import next_uniform
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
+from agents.planning.plan_mutations import next_uniform
 from agents.planning.plan_objective import MAX_MARGIN_FRACTION, objective_at
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient, project_input
 from estimator.belief import covariance_indices

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planning.belief_rollout import compile_belief_rollout
-from agents.planning.candidate_inputs import INPUT_FRACTIONS, allowed_input, next_uniform
+from agents.planning.plan_mutations import INPUT_FRACTIONS, allowed_input, next_uniform
 from agents.planning.plan_objective import PlanObjective
 from estimator.compilation.array_operations import aligned_matrix, copy, index_of_max
 from estimator.compilation.scalar_jit import scalar_jit

@@ -15,7 +15,7 @@ from duffing_env.storage.kernel_spec import observation_bounds
 from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -38,7 +38,7 @@ class ModelView(NamedTuple):
         """The view of an experiment of duffing_env.
 
         On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
-        start of a sample, as the environment feeds it (`duffing_env.kernel_stages.env_codegen`).
+        start of a sample, as the environment feeds it (`duffing_env.kernel_stages.generated_model_functions`).
         """
         model = experiment.model
         if model.is_continuous:
@@ -96,7 +96,7 @@ class LocalDynamics(NamedTuple):
     Attributes:
         outputs_shown: (n,) outputs of the first sensor.
         velocities: (n,) their velocities.
-        input_gains: (n,) the gain (`estimator.engine.noise_free_response`).
+        input_gains: (n,) the gain (`estimator.engine.noise_free_step`).
         jacobians: (n, states, states) of the linear part.
         regressors: (n, K) derivatives of the motion over a sample by the coefficients.
     """
@@ -110,8 +110,8 @@ class LocalDynamics(NamedTuple):
 
 @cache
 def _compile_local_dynamics(model: Model) -> Any:
-    """``local_dynamics(means, states, inputs, free_response)`` fills in a `LocalDynamics`."""
-    free_response = compile_noise_free_response(model)
+    """``probe_dynamics(means, states, inputs, free_response)`` fills in a `LocalDynamics`."""
+    free_response = compile_noise_free_step(model)
     at, sense, linearise, regress = (
         free_response.layout,
         free_response.output_now,
@@ -142,7 +142,7 @@ def _compile_local_dynamics(model: Model) -> Any:
     return local_dynamics_kernel
 
 
-def local_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> LocalDynamics:
+def probe_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u: float = 0.0) -> LocalDynamics:
     """Outputs and linearisations of systems at states and under an input.
 
     Args:
@@ -171,7 +171,7 @@ def resonance_frequencies(model: Model, jacobians: FloatArray) -> FloatArray:
 def believed_resonance(belief: Belief) -> float:
     """Resonance of a believed system for small motions, in cycles per sample; with two wells, in one of them."""
     means = belief.coefficients_mean
-    found = local_dynamics(belief.model, means, np.zeros(belief.model.n_states))
+    found = probe_dynamics(belief.model, means, np.zeros(belief.model.n_states))
     cycles = float(resonance_frequencies(belief.model, found.jacobians)[0])
     if cycles <= 0.0:
         stiffness = dict(zip(belief.names, means, strict=True)).get("stiffness", 0.0)

@@ -1,7 +1,7 @@
 """Refinement of plans of inputs: Newton steps on the whole plan, and random mutations, compiled for a model.
 
 A plan is improved in rounds. A round tries steps that change all of its first inputs (`agents.planning.newton_steps`)
-and mutated copies (`agents.planning.candidate_inputs`), and keeps the best candidate. The information that a move adds
+and mutated copies (`agents.planning.plan_mutations`), and keeps the best candidate. The information that a move adds
 is discounted by its place in the plan (`agents.planning.discount`).
 """
 
@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planning.belief_rollout import compile_belief_rollout
-from agents.planning.candidate_inputs import limit_slew, mutate_plan
 from agents.planning.discount import discount_weight_drop
 from agents.planning.newton_steps import fill_finite_differences, fill_newton_candidates
+from agents.planning.plan_mutations import limit_slew, mutate_plan
 from estimator.compilation.array_operations import copy, fill, index_of_max
 from estimator.compilation.simd import LANES, jit_closure
 from estimator.models.model import Model

@@ -22,12 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.planning.belief_rollout import compile_belief_rollout
-from agents.planning.candidate_inputs import hold_samples_for, shift_plan
 from agents.planning.d_optimality import factorise_information
 from agents.planning.discount import fill_discount_weights, filter_delay_in_moves
 from agents.planning.grid_beam_search import SearchProblem, compile_grid_beam_search
 from agents.planning.model_probe import ModelView
 from agents.planning.newton_steps import empty_candidate_batch
+from agents.planning.plan_mutations import hold_samples_for, shift_plan
 from agents.planning.plan_objective import PlanObjective, objective_at
 from agents.planning.plan_refinement import compile_plan_refinement
 from estimator.compilation.array_operations import copy, fill, index_of_max

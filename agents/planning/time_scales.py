@@ -14,7 +14,7 @@ import numpy.typing as npt
 from agents.planning.model_probe import ModelView, is_on_rig
 from estimator.compilation.array_operations import copy, fill
 from estimator.compilation.simd import kernel
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 from estimator.support.array_types import FloatArray
 
 #: Samples of the motion by which a system is measured.
@@ -62,7 +62,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
     These are the peaks of states and sensor, the samples in a period or 0, the samples until the limit is near or 0,
     and the change of the first sensor's output by the largest input over a sample from rest.
     """
-    free_response = compile_noise_free_response(*view)
+    free_response = compile_noise_free_step(*view)
     at, sense, glance, step = (
         free_response.layout,
         free_response.output_now,

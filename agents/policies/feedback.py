@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.planning.model_probe import local_dynamics, observation_layout, resonance_frequencies
+from agents.planning.model_probe import observation_layout, probe_dynamics, resonance_frequencies
 from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
 from agents.predict_checks import check_batch_size, check_state, episode_starts
@@ -73,7 +73,7 @@ class FeedbackPolicy:
         layout, k, n = self._layout, self._model.n_coefficients, self._model.n_states
         means = self._centers + self._stds * rows[:, layout.mean : layout.mean + k]
         states = self._limit * rows[:, layout.state : layout.state + n]
-        dynamics = local_dynamics(self._model, means, states)
+        dynamics = probe_dynamics(self._model, means, states)
         cycles = np.clip(resonance_frequencies(self._model, dynamics.jacobians), *_RESONANCE_BAND)
         return dynamics.outputs_shown / self._limit, dynamics.velocities / self._limit, cycles
 

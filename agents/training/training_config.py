@@ -12,7 +12,7 @@ from typing import Any, Literal
 from agents.json_options import JsonOptions
 from agents.policies.networks.trained_policy import CONFIG_FILE
 from agents.result_files import package_versions, write_json
-from agents.track_ids import RIG_TRACK, check_track_id, full_track_id, options_with_rig
+from agents.track_ids import RIG_TRACK, check_is_duffing_track, full_track_id, options_with_rig
 from agents.training.algorithms import ALGORITHMS, AlgorithmSettings, hyperparameters_to_dict
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.hyperparameters import parse_hyperparameters, read_hyperparameters
@@ -82,7 +82,7 @@ class TrainConfig(TrainingSubject):
         super().__post_init__()
         check_choice("algo", self.algo, ALGORITHMS)
         if not isinstance(self.env, str):
-            check_track_id(self.env)
+            check_is_duffing_track(self.env)
         check_mapping("options", self.options)
         check_env_options(self.options)
         # The options hold the rig itself, because its file may change.
@@ -107,7 +107,7 @@ class TrainConfig(TrainingSubject):
                 f"options must not hold branch, but are {self.options}; the other branches are for comparison"
             )
         if self.env != FAMILY:
-            check_track_id(self.env)
+            check_is_duffing_track(self.env)
         elif self.options or self.eval_every or self.algo != "ppo":
             raise ValueError(
                 f"env {FAMILY!r} takes no options, no eval_every, and ppo alone; leave them out, and compare from "

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from agents.datasets import Config as Dataset
 from agents.hardware.run_settings import RunSettings
+from agents.minari_datasets import Config as Dataset
 from agents.policies.networks.policy_saving import save_policy
 from agents.policies.signal_export import draw_signal
 from agents.training.training_config import TrainConfig

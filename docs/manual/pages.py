@@ -37,9 +37,9 @@ REFERENCE = {
     "duffing_env": [
         "duffing_env.vector_env.DuffingVectorEnv",
         "duffing_env.tracks.silverbox_replay.SilverboxReplayVectorEnv",
-        "duffing_env.env_base.ExperimentEnv",
+        "duffing_env.env_common.ExperimentEnv",
         "duffing_env.belief_arrays.Beliefs",
-        "duffing_env.tracks.rig_plant_env.Plant",
+        "duffing_env.tracks.external_plant_env.Plant",
         "duffing_env.plants.silverbox_record.load_record",
         "duffing_env.plants.silverbox_record.regime_input",
     ],

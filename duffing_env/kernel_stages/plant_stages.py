@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_uniform, word_to_float
+from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_open_uniform, word_to_float
 from estimator.compilation.simd import LANES, jit, lanewise
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
@@ -16,13 +16,13 @@ from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 _FLOAT32_ROUNDING = 2.0**-22
 
 
-def draw_noise(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
+def draw_two_normals(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
     """Draw two standard normal numbers; the stream of an environment that waits for its reset stands still."""
     first, a, b, c, d = sfc64_next(
         float_to_word(SFC64_a), float_to_word(SFC64_b), float_to_word(SFC64_c), float_to_word(SFC64_d)
     )
     second, a, b, c, d = sfc64_next(a, b, c, d)
-    w, v = box_muller(to_uniform(first), to_uniform(second))
+    w, v = box_muller(to_open_uniform(first), to_open_uniform(second))
     live = NEEDS_RESET == 0.0
     return (
         word_to_float(a) if live else SFC64_a, word_to_float(b) if live else SFC64_b,
@@ -31,8 +31,8 @@ def draw_noise(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
 
 
 def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
-    """``draw_noise(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
-    return lanewise(row_of, "SFC64_a SFC64_b SFC64_c SFC64_d NOISE_w NOISE_v")(draw_noise)
+    """``draw_two_normals(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
+    return lanewise(row_of, "SFC64_a SFC64_b SFC64_c SFC64_d NOISE_w NOISE_v")(draw_two_normals)
 
 
 def limit_input(REQUESTED_INPUT, INPUT, LAST_INPUT, ENERGY_SPENT, budget, max_slew):
@@ -71,8 +71,8 @@ def draw_parameter_jump(SFC64_a, SFC64_b, SFC64_c, SFC64_d, jump, horizon):
         float_to_word(SFC64_a), float_to_word(SFC64_b), float_to_word(SFC64_c), float_to_word(SFC64_d)
     )
     second, a, b, c, d = sfc64_next(a, b, c, d)
-    jump_sample = math.floor(horizon * (0.25 + 0.5 * to_uniform(first)))
-    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_uniform(second))
+    jump_sample = math.floor(horizon * (0.25 + 0.5 * to_open_uniform(first)))
+    factor = math.exp(low + (math.log(1.0 + jump) - low) * to_open_uniform(second))
     return word_to_float(a), word_to_float(b), word_to_float(c), word_to_float(d), jump_sample, factor
 
 
@@ -90,7 +90,7 @@ def draw_plant_parameters(W, j, params, first_stream, first_parameter):
         first, a, b, c, d = sfc64_next(a, b, c, d)
         if params.parameter_stds[p] != 0.0:
             second, a, b, c, d = sfc64_next(a, b, c, d)
-            deviation, _ = box_muller(to_uniform(first), to_uniform(second))
+            deviation, _ = box_muller(to_open_uniform(first), to_open_uniform(second))
             value = params.nominal_parameters[p] + params.parameter_stds[p] * deviation
             if params.parameter_stds[p] < 0.0:
                 value = params.nominal_parameters[p] * math.exp(params.parameter_stds[p] * deviation)
@@ -102,7 +102,7 @@ def draw_plant_parameters(W, j, params, first_stream, first_parameter):
             W[first_parameter + p * LANES + j] = value
         else:
             W[first_parameter + p * LANES + j] = params.nominal_parameters[p] * math.exp(
-                log_low + log_width * to_uniform(first)
+                log_low + log_width * to_open_uniform(first)
             )
     first_noise_std, log_noise_range = (
         first_parameter + len(params.nominal_parameters) * LANES,
@@ -112,7 +112,7 @@ def draw_plant_parameters(W, j, params, first_stream, first_parameter):
         std = params.process_noise if k == 0 else params.measurement_noise[k - 1]
         if params.noise_range > 1.0:
             first, a, b, c, d = sfc64_next(a, b, c, d)
-            std *= math.exp(log_noise_range * (to_uniform(first) - 0.5))
+            std *= math.exp(log_noise_range * (to_open_uniform(first) - 0.5))
         W[first_noise_std + k * LANES + j] = std
     W[first_stream + j], W[first_stream + LANES + j] = word_to_float(a), word_to_float(b)
     W[first_stream + 2 * LANES + j], W[first_stream + 3 * LANES + j] = word_to_float(c), word_to_float(d)

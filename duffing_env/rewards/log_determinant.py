@@ -34,8 +34,8 @@ def log_det_and_density(
     """
     import sympy as sp
 
-    from estimator.engine.ldl import ldl_factorise
     from estimator.engine.symbolic import symbol, symmetric_entry
+    from estimator.engine.symbolic_ldl import ldl_factorise
 
     names = list(model.coefficients)
     covariance_symbol = lambda i, k: symmetric_entry("P", names[k], names[i], model.names)  # noqa: E731

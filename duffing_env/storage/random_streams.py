@@ -49,7 +49,7 @@ def sfc64_next(a, b, c, counter):
 
 
 @scalar_jit
-def to_uniform(value):
+def to_open_uniform(value):
     """A uniform number in (0, 1) from a draw: the middle of one of 2^52 equal intervals."""
     return (np.float64(np.int64(value >> _S12)) + 0.5) * _UNIT_52
 

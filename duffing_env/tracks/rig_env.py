@@ -9,9 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from duffing_env.env import DuffingEnv
-from duffing_env.env_base import ReadOnlyOption
+from duffing_env.env_common import ReadOnlyOption
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
-from duffing_env.tracks.rig_plant_env import ONE_PLANT_MESSAGE, Plant, RigLike, RigPlantEnv, RigScaling, playable_rig
+from duffing_env.tracks.external_plant_env import (
+    ONE_PLANT_MESSAGE,
+    Plant,
+    RigLike,
+    RigPlantEnv,
+    RigScaling,
+    playable_rig,
+)
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.inference.noise_grid import NoiseGridSize
@@ -132,7 +139,7 @@ class RigEnv(DuffingEnv):
     An `estimator.Rig` describes the set-up of an oscillator m x'' + c x' + a x + b x³ = u + w: sampling step, units,
     limit of the input, range and kind of the sensor, and a guess of m, c, a and b. The environment draws oscillators
     from the guess, with offsets of input and output and noises unknown to estimator and policy, and simulates the
-    differential equation. ``plant=`` replaces the simulation by a real plant (`duffing_env.tracks.rig_plant_env`).
+    differential equation. ``plant=`` replaces the simulation by a real plant (`duffing_env.tracks.external_plant_env`).
 
     Internal numbers are in parts of the input's limit and the output's range; ``belief`` and ``truth`` are in the rig's
     units.
@@ -165,7 +172,7 @@ class RigEnv(DuffingEnv):
 
     ## Information
 
-    As `DuffingEnv`; with ``plant=`` as `duffing_env.tracks.rig_plant_env.RigPlantEnv`.
+    As `DuffingEnv`; with ``plant=`` as `duffing_env.tracks.external_plant_env.RigPlantEnv`.
 
     ## Arguments
 

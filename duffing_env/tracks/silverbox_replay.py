@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from duffing_env.env import DuffingEnv
-from duffing_env.env_base import ReadOnlyOption
+from duffing_env.env_common import ReadOnlyOption
 from duffing_env.experiment_config import Experiment
 from duffing_env.plants.silverbox_record import REGIME_NAMES, Regime, load_record
 from duffing_env.vector_env import DuffingVectorEnv

@@ -40,9 +40,9 @@ def _difference_track(entry_point: str, **overrides: Any) -> dict[str, Any]:
 
 def _continuous_track(env_class: str, **overrides: Any) -> dict[str, Any]:
     """A track on the differential equation, with the options that differ from Amplitude-v1."""
-    vector_entry_point = "tracks.continuous_tracks:ContinuousVectorEnv"
+    vector_entry_point = "tracks.differential_equation_tracks:ContinuousVectorEnv"
     return _registration(
-        f"tracks.continuous_tracks:{env_class}",
+        f"tracks.differential_equation_tracks:{env_class}",
         vector_entry_point,
         **{**_DUFFING_LIMITS, **overrides, **_UNKNOWN_NOISES},
     )
@@ -54,7 +54,7 @@ def _model_track(system: str, **kwargs: Any) -> dict[str, Any]:
 
 
 #: Id of a track to its registration. Any change of numbers or spaces is a new version. No track registers
-#: ``max_episode_steps``: its time limit would truncate a longer ``horizon`` (`duffing_env.env_base.ExperimentEnv`).
+#: ``max_episode_steps``: its time limit would truncate a longer ``horizon`` (`duffing_env.env_common.ExperimentEnv`).
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": _difference_track("env:DuffingEnv"),
     "duffing_env/Short-v0": _difference_track("tracks.limited_tracks:ShortEnv", horizon=48),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numba
 
-from estimator.compilation.disk_cache import DiskCache
+from estimator.compilation.fault_tolerant_cache import DiskCache
 from estimator.compilation.inner_function_jit import InnerDispatcher
 from estimator.compilation.scalar_jit import scalar_jit, scalar_jit_from_source
 
@@ -106,7 +106,7 @@ def _argument_text(function: Callable[..., Any], layout: Mapping[str, int], unif
 
 
 def kernel(function: Callable[..., Any] | None = None, *, variant: str = "", **options: Any) -> Any:
-    """Compile an entry point: a function with callers in Python, cached on disk (`estimator.compilation.disk_cache`).
+    """Compile an entry point, which Python calls, and cache it (`estimator.compilation.fault_tolerant_cache`).
 
     Numba's own cache misses changes in the files of called functions, and a stale kernel would give wrong numbers in
     silence. So this cache has a digest of all sources.

@@ -14,7 +14,7 @@ from typing import Any
 
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
-from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, likelihood_rows
+from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, likelihood_total_rows
 from estimator.models.model import Model
 
 
@@ -76,7 +76,7 @@ def _source(model: Model, degree: int) -> str:
 
     coefficients, integrated = list(model.coefficients), integrator_rows(model)
     path_rows, inputs = filter_state_rows(model), input_rows(model, degree)
-    information = [row for row in likelihood_rows(model) if row.startswith("INFORMATION_")]
+    information = [row for row in likelihood_total_rows(model) if row.startswith("INFORMATION_")]
     noises = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)]
     shown = f"Y_PRED_{next(iter(model.outputs))}"
     before, propagation = symbolic.propagate_sample(model)

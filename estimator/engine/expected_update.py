@@ -153,7 +153,7 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     import sympy as sp
 
     from estimator.engine import printer_numba, symbolic
-    from estimator.engine.ldl import ldl_factorise
+    from estimator.engine.symbolic_ldl import ldl_factorise
 
     symbol, names = symbolic.symbol, list(model.coefficients)
     k = len(names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine.printer_numba import print_expression
-from estimator.engine.storage_layout import likelihood_rows
+from estimator.engine.storage_layout import likelihood_total_rows
 from estimator.engine.symbolic import (
     HALF,
     ZERO,
@@ -30,7 +30,7 @@ def linearised_filter_step(
 
         V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
 
-    Rows are `filter_state_rows` and `likelihood_rows` of `estimator.engine.storage_layout`, the noise variances
+    Rows are `filter_state_rows` and `likelihood_total_rows` of `estimator.engine.storage_layout`, the noise variances
     ``Q`` and ``R_<sensor>``, and ``LIVE``, which is 0 where the sample does not count.
 
     Args:
@@ -74,7 +74,7 @@ def linearised_filter_step(
     at = lambda i, k: cov[(i, k) if states.index(i) <= states.index(k) else (k, i)]  # noqa: E731
     found = differentiate(model)
     results: dict[str, str] = {}
-    totals = {name: symbol(name) for name in likelihood_rows(model)}
+    totals = {name: symbol(name) for name in likelihood_total_rows(model)}
     for k, sensor in enumerate(model.outputs):
         tag = str(k)
         at_mean = {symbol(i): value for i, value in mean.items()} | {symbol("u"): input_at_end(model, degree)}

@@ -1,7 +1,7 @@
 """Cache of generated source on disk: a damaged file is generated anew.
 
 The name of a file has the model, the purpose, and a digest of the engine and its arguments. The files are plain Python,
-in `estimator.compilation.disk_cache.cache_folder` beside the compiled code.
+in `estimator.compilation.fault_tolerant_cache.cache_folder` beside the compiled code.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from estimator.compilation.disk_cache import cache_folder, write_cached
+from estimator.compilation.fault_tolerant_cache import cache_folder, write_cached
 from estimator.compilation.scalar_jit import scalar_jit_from_source
 from estimator.compilation.simd import jit_closure
 

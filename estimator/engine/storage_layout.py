@@ -73,7 +73,7 @@ def filter_state_rows(model: Model) -> list[str]:
     return [*model.states, *upper_triangle_names("P", model.states), *sensitivities]
 
 
-def likelihood_rows(model: Model) -> list[str]:
+def likelihood_total_rows(model: Model) -> list[str]:
     """Totals of the linearised filter: minus the log likelihood, its gradient, the Fisher information, and Σ ν²/S."""
     return [
         "LOSS",
@@ -98,4 +98,4 @@ def linearised_filter_layout(
         *(f"R_{y}" for y in model.outputs),
     ]
     given += ["SAMPLE_LENGTH"] if variable_step else []
-    return number_rows(*filter_state_rows(model), *likelihood_rows(model), *given, *integrator_rows(model))
+    return number_rows(*filter_state_rows(model), *likelihood_total_rows(model), *given, *integrator_rows(model))

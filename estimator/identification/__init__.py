@@ -21,12 +21,8 @@ from estimator.identification.fitting.posterior_belief import (
     posterior_belief,
 )
 from estimator.identification.identification_result import Result, parameter_moments
-from estimator.identification.likelihood.identification_problem import (
-    MAX_UNSTATED_DELAY,
-    TARGET_PARAMETERS,
-    IdentificationProblem,
-)
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
+from estimator.identification.likelihood.scaled_records import MAX_UNSTATED_DELAY, TARGET_PARAMETERS, ScaledRecords
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import Scales
@@ -93,7 +89,7 @@ def identify(rig: Rig | Mapping[str, Any] | str | Path, records: Any, progress: 
             else tuple(one.times_in_steps(rig.step) for one in parsed_records)
         )
         search_result = search_coefficients(
-            IdentificationProblem(rig, scales, u, tuple(one - origin for one in y), origin, times=times), on_progress
+            ScaledRecords(rig, scales, u, tuple(one - origin for one in y), origin, times=times), on_progress
         )
         problem = search_result.fitter.problem
         # Forecasts and comparisons of equations use the most probable point of a ridge.

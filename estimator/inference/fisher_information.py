@@ -15,12 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.input_hold import input_degree
-from estimator.inference.record_filter import (
-    filter_records,
-    inputs_by_sample,
-    noise_variances,
-    outputs_by_sensor,
-)
+from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import physical_jacobian, to_physical
 from estimator.rigs.units import VOLT_SCALES, Scales
@@ -84,7 +79,7 @@ def fisher_information(
         return np.broadcast_to(array, (*shape, *last)).reshape(rows, *last).copy()
 
     covariance = float(state_std) ** 2 * np.eye(model.n_states)
-    filtered = filter_records(
+    filtered = record_likelihoods(
         model,
         broadcast(points, model.n_coefficients),
         inputs_by_sample(model, broadcast(inputs, samples), degree),

@@ -20,12 +20,7 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine.input_hold import input_degree
-from estimator.inference.record_filter import (
-    filter_records,
-    inputs_by_sample,
-    noise_variances,
-    outputs_by_sensor,
-)
+from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
 from estimator.models.model import Model
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
@@ -118,7 +113,7 @@ def maximum_a_posteriori(
         return coefficients
 
     def loss_and_derivatives(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        filtered = filter_records(model, coefficients_at(points), sample_inputs, outputs, noises, prior.state_cov)
+        filtered = record_likelihoods(model, coefficients_at(points), sample_inputs, outputs, noises, prior.state_cov)
         prior_gradient = points @ precision
         loss = filtered.loss + 0.5 * (points * prior_gradient).sum(axis=1)
         curvature = filtered.information[:, free[:, None], free] * np.outer(scale, scale) + precision

@@ -73,7 +73,7 @@ def noise_grid(noises: FloatArray, grid_size: NoiseGridSize) -> FloatArray:
         process, sensor = (GRID_FACTOR ** (2 * np.arange(count) - (count - 1.0)) for count in grid_size)
         return np.array([noises * [1.0, a, 1.0, b] for a in process for b in sensor])
     factors = np.geomspace(1 / MAX_RATIO_FACTOR, MAX_RATIO_FACTOR, grid_size)
-    return np.array([scale_noises(noises, factor, level) for level in TOTAL_STD_FACTORS for factor in factors])
+    return np.array([scale_noise_gammas(noises, factor, level) for level in TOTAL_STD_FACTORS for factor in factors])
 
 
 def member_priors(prior: Belief, grid_size: NoiseGridSize) -> FloatArray:
@@ -124,7 +124,7 @@ def pack_into_lanes(records: FloatArray, lanes: int) -> FloatArray:
     return padded.reshape(blocks, lanes, -1).transpose(0, 2, 1).reshape(blocks, -1)
 
 
-def scale_noises(noises: FloatArray, ratio_factor: float, total_std_factor: float) -> FloatArray:
+def scale_noise_gammas(noises: FloatArray, ratio_factor: float, total_std_factor: float) -> FloatArray:
     """(4,) shapes and rates with σ_w/σ_v scaled by ``ratio_factor`` and σ_w² + σ_v² by ``total_std_factor``²."""
     q, r = noises[1] / noises[0], noises[3] / noises[2]
     ratio, total = ratio_factor**2 * q / r, total_std_factor**2 * (q + r)

@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from estimator.compilation.simd import jit, kernel
 from estimator.engine.kernels import compile_linearised_filter
-from estimator.engine.storage_layout import likelihood_rows
+from estimator.engine.storage_layout import likelihood_total_rows
 from estimator.inference.input_interpolation import record_lengths
 from estimator.models.model import Model
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
 
-class FilteredRecords(NamedTuple):
-    """Totals of `filter_records` over n series.
+class RecordLikelihoods(NamedTuple):
+    """Totals of `record_likelihoods` over n series.
 
     Attributes:
         loss: (n,) minus the log likelihood, up to a constant; zeros without outputs.
@@ -47,7 +47,7 @@ def inputs_by_sample(model: Model, u: FloatArray, degree: int = 0) -> FloatArray
     return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # NaN beyond the end
 
 
-def filter_records(
+def record_likelihoods(
     model: Model,
     coefficients: FloatArray,
     inputs: FloatArray,
@@ -57,7 +57,7 @@ def filter_records(
     initial_state: FloatArray | float = 0.0,
     sample_lengths: FloatArray | None = None,
     forecasts: FloatArray | None = None,
-) -> FilteredRecords:
+) -> RecordLikelihoods:
     """Run the linearised Kalman filter over n series.
 
     Args:
@@ -73,7 +73,7 @@ def filter_records(
     """
     k = model.n_coefficients
     lengths = record_lengths(inputs[:, :, 0])
-    totals = np.zeros((len(inputs), len(likelihood_rows(model))))
+    totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
     initial_moments = np.empty((len(inputs), model.n_states + (model.n_states * (model.n_states + 1)) // 2))
     initial_moments[:, : model.n_states], initial_moments[:, model.n_states :] = (
         initial_state,
@@ -90,7 +90,7 @@ def filter_records(
     information = np.empty((len(inputs), k, k))
     upper = _upper_triangle(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
-    return FilteredRecords(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
+    return RecordLikelihoods(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
 
 
 #: (rows, columns) of the upper triangle of a square matrix.
@@ -110,7 +110,7 @@ class _RowOffsets(NamedTuple):
         n_state_moments: means and covariances of the states.
         n_coefficients: coefficients.
         n_outputs: sensors.
-        n_totals: rows of `FilteredRecords`.
+        n_totals: rows of `RecordLikelihoods`.
         coefficient: first coefficient.
         noise: variance of the process noise; the sensors' follow.
         input: first row of the input.
@@ -199,7 +199,7 @@ def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
 
 @cache
 def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
-    """Compile the loop of `filter_records`, with totals (n, 2 + K + K (K + 1)/2) packed."""
+    """Compile the loop of `record_likelihoods`, with totals (n, 2 + K + K (K + 1)/2) packed."""
     linearised_filter = compile_linearised_filter(
         model, degree, follows_outputs=follows_outputs, lanes=_FIT_LANES, variable_step=variable_step
     )
@@ -209,7 +209,7 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
         n_state_moments=n + n * (n + 1) // 2,
         n_coefficients=model.n_coefficients,
         n_outputs=model.n_outputs,
-        n_totals=len(likelihood_rows(model)),
+        n_totals=len(likelihood_total_rows(model)),
         coefficient=rows[next(iter(model.coefficients))],
         noise=rows["PROCESS_VARIANCE"],
         input=rows["U_0"],

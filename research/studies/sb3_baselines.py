@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from agents.cli import run_script
-from agents.track_ids import check_track_id, full_track_id
+from agents.track_ids import check_is_duffing_track, full_track_id
 from estimator.support.optional_dependencies import require_packages
 
 
@@ -33,7 +33,7 @@ class Config:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env", full_track_id(self.env))
-        check_track_id(self.env)
+        check_is_duffing_track(self.env)
 
     @property
     def folder(self) -> Path:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from agents.cli import run_script
 from agents.console_output import format_table, print_texts_and_tables
-from agents.evaluation.policy_groups import check_policies_can_play
+from agents.evaluation.policy_arguments import check_policies_can_play
 from agents.evaluation.track_batch import TEST_OPTIONS, make_track_batch
 from agents.policies import make_policy
 from agents.result_files import write_json

@@ -12,7 +12,7 @@ from agents.planning.d_optimality import NominalSystem, compile_d_optimality
 from agents.planning.energy_limited_plan import compile_energy_limited_plan
 from agents.planning.plan_objective import PlanObjective
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.tracks.continuous_tracks import ContinuousExperiment
+from duffing_env.tracks.differential_equation_tracks import ContinuousExperiment
 from estimator.belief import Belief
 from estimator.compilation.simd import LANES
 from estimator.engine.expected_update import DIVERGED_SCORE, compile_expected_update

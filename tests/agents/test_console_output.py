@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from agents.cli import one_line_errors
-from agents.console_output import format_table, print_texts_and_tables, print_wrapped
+from agents.console_output import format_table, print_in_80_columns, print_texts_and_tables
 
 WORDS = [f"column {i} of many" for i in range(30)]
 
@@ -30,7 +30,7 @@ def test_a_table_that_is_too_wide_is_several_with_the_same_labels(capsys, monkey
 
 def test_a_text_is_broken_between_words_and_a_path_is_not(capsys):
     path = "/" + "folder-of-a-run/" * 8
-    print_wrapped("word " * 40 + path + "\n  indented")
+    print_in_80_columns("word " * 40 + path + "\n  indented")
     *words, whole, last = capsys.readouterr().out.splitlines()
     assert " ".join(words) == ("word " * 40).strip()
     assert max(map(len, words)) <= 80

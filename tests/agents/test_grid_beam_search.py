@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from agents.evaluation.track_batch import make_track_batch
-from agents.planning.candidate_inputs import INPUT_FRACTIONS, next_uniform
 from agents.planning.grid_beam_search import (
     _N_BISECTIONS,
     _PRUNE_GAP,
@@ -16,6 +15,7 @@ from agents.planning.grid_beam_search import (
     compile_grid_beam_search,
     score_threshold,
 )
+from agents.planning.plan_mutations import INPUT_FRACTIONS, next_uniform
 from agents.planning.plan_objective import objective_at
 from agents.policies import make_policy
 from estimator.belief import covariance_indices

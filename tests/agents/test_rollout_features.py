@@ -18,7 +18,7 @@ from agents.evaluation.track_batch import make_track_batch
 from agents.planning.model_probe import observation_layout
 from agents.policies.networks.feature_encoder import FeatureEncoder, ShieldedFeatures
 from agents.policies.networks.feature_names import FEATURE_NAMES, MAX_FEATURE
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"
 REACHES = [FEATURE_NAMES.index(f"braked_peak_with_margin_{first}") for first in ("down", "none", "up")]
@@ -115,7 +115,7 @@ def test_an_observation_looks_the_same_alone_in_a_batch_and_turned_over(name):
         for whole, alone in zip(together, found(seen[i : i + 1]), strict=True):
             np.testing.assert_array_equal(alone[0], whole[i])
     at, model = observation_layout(found.model_view.model), found.model_view.model
-    if not compile_noise_free_response(*found.model_view).is_odd:  # a rig has offsets
+    if not compile_noise_free_step(*found.model_view).is_odd:  # a rig has offsets
         assert name == "rig"
         assert (together.mirror_signs == 1).all()
         return

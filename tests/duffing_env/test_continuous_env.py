@@ -6,7 +6,7 @@ import pytest
 from playing import random_actions
 from twin import TwinContinuousEnv, assert_env_follows_twin
 
-from duffing_env.tracks.continuous_tracks import ContinuousEnv, ContinuousVectorEnv
+from duffing_env.tracks.differential_equation_tracks import ContinuousEnv, ContinuousVectorEnv
 
 TRACK = "duffing_env/Amplitude-v1"
 #: As they are compiled for tests/specimens.py: the belief does not depend on the reward.

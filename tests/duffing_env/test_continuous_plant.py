@@ -8,11 +8,11 @@ from reference.filters import continuous_step
 from scipy.integrate import solve_ivp
 from twin import to_rates
 
-from duffing_env.kernel_stages.env_codegen import generated_functions
+from duffing_env.kernel_stages.generated_model_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.kernel_stages.sample_stages import compile_simulation
 from duffing_env.storage.kernel_spec import block_layout
-from duffing_env.tracks.continuous_tracks import ContinuousExperiment
+from duffing_env.tracks.differential_equation_tracks import ContinuousExperiment
 from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP
 from estimator.compilation.simd import LANES
 from estimator.models.duffing import duffing

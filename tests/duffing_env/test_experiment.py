@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from duffing_env.env_base import make_experiment
+from duffing_env.env_common import make_experiment
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import compile_unpacker, pack_params
-from duffing_env.tracks.continuous_tracks import ContinuousExperiment
+from duffing_env.tracks.differential_equation_tracks import ContinuousExperiment
 from duffing_env.tracks.silverbox_replay import ReplayExperiment
 from estimator import SILVERBOX_ODE_TWIN, SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN
 from estimator.models.difference_equation import difference

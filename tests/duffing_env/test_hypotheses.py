@@ -12,7 +12,7 @@ from twin import TwinContinuousEnv, TwinEnv, assert_env_follows_twin
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.differential_equation_tracks import ContinuousEnv
 from duffing_env.tracks.model_env import ModelEnv
 from duffing_env.tracks.silverbox_replay import ReplayExperiment
 from duffing_env.tracks.track_registry import TRACKS

@@ -14,7 +14,7 @@ from duffing_env.storage.random_streams import (
     float_to_word,
     new_stream_words,
     sfc64_next,
-    to_uniform,
+    to_open_uniform,
     word_to_float,
 )
 from estimator.compilation.simd import LANES
@@ -90,9 +90,9 @@ def test_streams_in_blocks_are_those_of_numpy():
 
 
 def test_uniform_numbers_are_inside_the_unit_interval():
-    assert to_uniform(np.uint64(0)) == 2.0**-53
-    assert to_uniform(np.uint64(2**64 - 1)) == 1.0 - 2.0**-53
-    assert to_uniform(np.uint64(1 << 63)) == 0.5 + 2.0**-53
+    assert to_open_uniform(np.uint64(0)) == 2.0**-53
+    assert to_open_uniform(np.uint64(2**64 - 1)) == 1.0 - 2.0**-53
+    assert to_open_uniform(np.uint64(1 << 63)) == 0.5 + 2.0**-53
 
 
 def test_normal_pair_is_box_and_muller():

@@ -10,7 +10,7 @@ from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
-from duffing_env.tracks.continuous_tracks import ContinuousEnv
+from duffing_env.tracks.differential_equation_tracks import ContinuousEnv
 from duffing_env.tracks.model_env import ModelExperiment
 from duffing_env.tracks.track_registry import TRACKS
 from duffing_env.vector_env import DuffingVectorEnv

@@ -12,7 +12,7 @@ from estimator.inference.fisher_information import (
     fisher_information,
     relative_covariance,
 )
-from estimator.inference.record_filter import filter_records, inputs_by_sample
+from estimator.inference.record_filter import inputs_by_sample, record_likelihoods
 from estimator.rigs.physical_parameters import coefficients_of
 
 Q, R = 5e-4, 3e-4
@@ -196,7 +196,7 @@ def test_the_likelihood_of_any_model_is_that_of_a_filter_with_matrices(case):
         )
         y += r * rng.standard_normal(y.shape)
         laid, cov = inputs_by_sample(model, u, int(interpolation == "linear")), spread**2 * np.eye(model.n_states)
-        found = filter_records(model, points, laid, y, noises, cov, *((begin,) if spread else ()))
+        found = record_likelihoods(model, points, laid, y, noises, cov, *((begin,) if spread else ()))
         for row in range(2):
             expected = along(case, u[row], q, r, y[row], begin[row], spread**2)
             assert found.loss[row] == pytest.approx(expected.loss, rel=1e-9)

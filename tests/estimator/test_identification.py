@@ -8,9 +8,9 @@ from oscillators import BENCH, SOFT, WELLS, deviations, rig_of, simulated, struc
 
 from estimator import Channel, Rig, identify
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
-from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
+from estimator.identification.likelihood.scaled_records import MAX_UNSTATED_DELAY, ScaledRecords
 from estimator.inference.free_run import free_run
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, duffing
 from estimator.rigs.physical_parameters import coefficients_of
@@ -102,7 +102,7 @@ def test_what_few_samples_tell_is_a_covariance_in_spite_of_rounding():
     """Two offsets that show as one leave a covariance that is symmetric to nine digits."""
     u, y = simulated(SOFT)
     rig = rig_of(SOFT)
-    problem = IdentificationProblem(rig, rig.scales, (u,), (y,))
+    problem = ScaledRecords(rig, rig.scales, (u,), (y,))
     std = np.array([1e-3, 1e-2, 1e-4, 5e-2, 5e-2, 1e-1])
     shape = np.eye(6)
     shape[3, 4], shape[4, 3] = -1.0 + 1e-9, -1.0 + 1e-9 + 4e-9
@@ -128,7 +128,7 @@ def test_the_motion_before_each_record_is_found(kind):
     v = shown["velocity"] * Scales(step, amplitude, 1e-2, 1).displacement / scales.displacement
     rig = rig_of(SOFT, kind)
     pieces = [slice(k, k + 100) for k in places]
-    problem = IdentificationProblem(
+    problem = ScaledRecords(
         rig,
         scales,
         tuple(u[p] / amplitude for p in pieces),

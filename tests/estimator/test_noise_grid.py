@@ -18,7 +18,7 @@ from estimator.inference.noise_grid import (
     member_priors,
     moment_matched_gamma,
     pack_into_lanes,
-    scale_noises,
+    scale_noise_gammas,
 )
 from estimator.inference.noise_mixture import (
     SWITCHING_PROBABILITY,
@@ -52,7 +52,7 @@ def members(name):
     model, prior = MODELS[name]["model"], MODELS[name]["prior"]
     for level in (1 / 3, 1, 3):
         for factor in (1 / 30, 30**-0.5, 1, 30**0.5, 30):
-            g_shape, g_rate, n_shape, n_rate = scale_noises(prior.noises, factor, level)
+            g_shape, g_rate, n_shape, n_rate = scale_noise_gammas(prior.noises, factor, level)
             moved = Belief.of(model, prior.mean, prior.cov, (g_shape, g_rate), (n_shape, n_rate))
             yield OnlineEstimator(**MODELS[name] | {"prior": moved})
 
@@ -126,12 +126,12 @@ def test_nothing_left_is_not_finite():
 
 def test_displacement_keeps_the_shapes_and_says_ratio_and_sum():
     noises = np.array([2.0, 2.0 * 3e-3**2, 5.0, 5.0 * 1e-3**2])
-    moved = scale_noises(noises, 7.0, 3.0)
+    moved = scale_noise_gammas(noises, 7.0, 3.0)
     q, r = moved[1] / moved[0], moved[3] / moved[2]
     assert (moved[0], moved[2]) == (2.0, 5.0)
     assert np.sqrt(q / r) == pytest.approx(7 * 3)
     assert q + r == pytest.approx(9 * (3e-3**2 + 1e-3**2))
-    np.testing.assert_allclose(scale_noises(noises, 1.0, 1.0), noises, rtol=1e-14)
+    np.testing.assert_allclose(scale_noise_gammas(noises, 1.0, 1.0), noises, rtol=1e-14)
 
 
 def test_first_weights_are_half_a_cauchy_density_of_the_ratio():

@@ -29,7 +29,7 @@ from agents.planning.projected_gradient import DesignLimits, project_input
 from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel
-from estimator.engine.noise_free_response import with_coarse_substeps
+from estimator.engine.noise_free_step import with_coarse_substeps
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback, ignore_progress

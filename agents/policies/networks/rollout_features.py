@@ -39,7 +39,7 @@ from agents.policies.networks.feature_names import (
 from agents.policies.networks.rollout_rows import rollout_rows
 from estimator.compilation.array_operations import copy, copy_scaled, fill
 from estimator.compilation.simd import jit, jit_closure
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 
 #: Moves of a rollout, with the first input's.
 _N_LOOKAHEAD_MOVES = 5
@@ -73,7 +73,7 @@ def _covariance_at_end(C, information_rate, n_samples, W, work):
 def _compile_decoding(view: ModelView) -> tuple[Any, Any]:
     """``decode_belief`` and ``mirror``."""
     sense, layout, rows = (
-        compile_noise_free_response(*view).output_now,
+        compile_noise_free_step(*view).output_now,
         observation_layout(view.model),
         rollout_rows(view),
     )
@@ -111,7 +111,7 @@ def _compile_decoding(view: ModelView) -> tuple[Any, Any]:
 @cache
 def _compile_roll_out(view: ModelView) -> Any:
     """``roll_out``, as below."""
-    free_response, rows = compile_noise_free_response(*view), rollout_rows(view)
+    free_response, rows = compile_noise_free_step(*view), rollout_rows(view)
     sense, step = free_response.output_now, free_response.step
     size, n, k, u, velocity, signal, phi = (
         rows.size, rows.n, rows.k, rows.u, rows.velocity, rows.signal, rows.phi
@@ -243,7 +243,7 @@ def compile_features(view: ModelView) -> tuple[Any, Any]:
     them. With ``with_observation`` the observation follows the features. ``work`` is a ``workspace()``.
     """
     layout, rows = observation_layout(view.model), rollout_rows(view)
-    size, k, velocity, is_odd = rows.size, rows.k, rows.velocity, compile_noise_free_response(*view).is_odd
+    size, k, velocity, is_odd = rows.size, rows.k, rows.velocity, compile_noise_free_step(*view).is_odd
     decode_belief, mirror = _compile_decoding(view)
     write_uncertainty, write_motion, append_observation = _compile_writing(view)
     roll_out, compile_inner = _compile_roll_out(view), jit_closure(view.compile_key)

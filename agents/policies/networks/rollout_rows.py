@@ -7,11 +7,11 @@ from itertools import combinations
 from typing import NamedTuple
 
 from agents.planning.model_probe import ModelView, observation_layout
-from estimator.engine.noise_free_response import compile_noise_free_response
+from estimator.engine.noise_free_step import compile_noise_free_step
 
 
 class RolloutRows(NamedTuple):
-    """Rows and sizes of a rollout (`estimator.engine.noise_free_response`), and of its observation.
+    """Rows and sizes of a rollout (`estimator.engine.noise_free_step`), and of its observation.
 
     Attributes:
         size: numbers of a rollout.
@@ -44,7 +44,7 @@ class RolloutRows(NamedTuple):
 def rollout_rows(view: ModelView) -> RolloutRows:
     """The rows of a model's rollout."""
     model, layout = view.model, observation_layout(view.model)
-    row = compile_noise_free_response(*view).layout
+    row = compile_noise_free_step(*view).layout
     # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states, sensor = (model.rates or ("",))[0], list(model.states), next(iter(model.outputs.values()))
     velocity_state = states.index(rate) if rate in states and sensor != states[0] else -1

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from agents.policies.networks.compiled_actor import CompiledActor, compile_decision
+from agents.policies.networks.compiled_decision import CompiledActor, compile_decision
 from agents.policies.networks.feature_encoder import FeatureEncoder
 from agents.policies.networks.lstm import FloatArray, Lstm, checked_tensor
 from agents.predict_checks import check_observation_finite, check_observation_size

@@ -10,15 +10,12 @@ import numpy as np
 from estimator.belief import Belief
 from estimator.identification.data.sensor_faults import undo_high_pass
 from estimator.identification.diagnostics.check_finding import CheckFinding
-from estimator.identification.diagnostics.input_path_checks import MIN_EVIDENCE, best_free_energies
+from estimator.identification.diagnostics.input_timing_checks import MIN_EVIDENCE, best_free_energies
 from estimator.identification.diagnostics.spring_equilibrium import find_equilibrium
 from estimator.identification.diagnostics.trigger_offset import find_trigger_offset
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.likelihood.identification_problem import (
-    OPTIONAL_TERMS,
-    IdentificationProblem,
-)
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import OPTIONAL_TERMS, ScaledRecords
 from estimator.rigs.channel import Channel
 
 #: Largest disturbance of the force that passes, as a fraction of the input's root mean square.
@@ -57,7 +54,7 @@ def search_failed_finding(search_result: SearchResult) -> CheckFinding:
     return CheckFinding("search_failed", message)
 
 
-def check_trigger_offset(problem: IdentificationProblem) -> list[CheckFinding]:
+def check_trigger_offset(problem: ScaledRecords) -> list[CheckFinding]:
     """A finding where the channels were triggered far apart."""
     delay_samples = find_trigger_offset(problem)
     if delay_samples is None:
@@ -73,7 +70,7 @@ def check_trigger_offset(problem: IdentificationProblem) -> list[CheckFinding]:
     return [CheckFinding("delay", f"{what}, and identify again: the channels were triggered apart")]
 
 
-def check_missing_terms(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:
+def check_missing_terms(problem: ScaledRecords, search_result: SearchResult) -> list[CheckFinding]:
     """A finding for the term of the equation, or the high-pass of the sensor, with the most evidence."""
     baseline, gains = float(search_result.fits.free_energy.min()), []
     for name in OPTIONAL_TERMS:
@@ -123,7 +120,7 @@ def disturbance_message(channel: Channel, input_rms: float, disturbance_std: flo
     return f"the force has a disturbance of {disturbance_std:.3g} {channel.unit} in every sample{part}"
 
 
-def check_process_noise(problem: IdentificationProblem, disturbance: tuple[float, float]) -> list[CheckFinding]:
+def check_process_noise(problem: ScaledRecords, disturbance: tuple[float, float]) -> list[CheckFinding]:
     """A finding where the disturbance of the force, (mean, standard deviation), is surely larger than usual."""
     channel, input_rms, (mean, std) = problem.rig.input, problem.input_rms * problem.scales.input, disturbance
     # A disturbance that the sensor's noise hides has a wide interval, whose lower end is small.
@@ -133,7 +130,7 @@ def check_process_noise(problem: IdentificationProblem, disturbance: tuple[float
     return [CheckFinding("process_noise", f"{disturbance_message(channel, input_rms, mean)}; {cause}")]
 
 
-def check_asymmetry(problem: IdentificationProblem, belief: Belief) -> list[CheckFinding]:
+def check_asymmetry(problem: ScaledRecords, belief: Belief) -> list[CheckFinding]:
     """A finding where the spring rests away from its inflection, so that a is not its stiffness at rest."""
     equilibrium = find_equilibrium(belief)
     if equilibrium is None or equilibrium.is_symmetric:
@@ -154,9 +151,7 @@ def check_asymmetry(problem: IdentificationProblem, belief: Belief) -> list[Chec
     return [CheckFinding("asymmetric", message)]
 
 
-def check_input_lag(
-    problem: IdentificationProblem, parameters: Mapping[str, tuple[float, float]]
-) -> list[CheckFinding]:
+def check_input_lag(problem: ScaledRecords, parameters: Mapping[str, tuple[float, float]]) -> list[CheckFinding]:
     """A finding where a lag of the input leaves the mass uncertain: a coil's damping lags as its force does."""
     lag, (m, std), (c, _) = problem.rig.input.lag, parameters["m"], parameters["c"]
     if lag is None or abs(c) * lag < std:

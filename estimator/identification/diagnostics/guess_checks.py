@@ -10,8 +10,8 @@ import numpy as np
 from estimator.identification.diagnostics.check_finding import CheckFinding
 from estimator.identification.fitting.multistart_search import search_coefficients
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT, belief_from_moments
 
 #: Parameter to mean and standard deviation, in the rig's units.
@@ -121,7 +121,7 @@ def _scaled(parameter: tuple[float, float], factor: float) -> tuple[float, float
     return parameter[0] * factor, parameter[1] * factor
 
 
-def fit_without_guess(problem: IdentificationProblem, search_result: SearchResult) -> tuple[ParameterMoments, float]:
+def fit_without_guess(problem: ScaledRecords, search_result: SearchResult) -> tuple[ParameterMoments, float]:
     """Fit the parameters without the guess, and compare the evidence.
 
     Both fits are judged without the guess, which would hold one of them for improbable.

@@ -9,10 +9,7 @@ import numpy as np
 from estimator.identification.diagnostics.check_finding import CheckFinding
 from estimator.identification.fitting.ridge_posterior import ONE_STD_PROBABILITY, RidgePosterior
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.likelihood.identification_problem import (
-    TARGET_PARAMETERS,
-    IdentificationProblem,
-)
+from estimator.identification.likelihood.scaled_records import TARGET_PARAMETERS, ScaledRecords
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.support.array_types import FloatArray
 
@@ -34,7 +31,7 @@ _MAX_LINEAR_CUBIC_FRACTION = 0.05
 
 
 def check_identifiability(
-    problem: IdentificationProblem,
+    problem: ScaledRecords,
     search_result: SearchResult,
     ridges: RidgePosterior | None,
     parameters: dict[str, tuple[float, float]],
@@ -89,14 +86,14 @@ def _is_single_sine(inputs: Sequence[FloatArray]) -> bool:
     return bool((np.ptp(found, axis=0) < _SINE_TOLERANCE * np.mean(found, axis=0)).all())
 
 
-def _max_cubic_fraction(problem: IdentificationProblem, parameters: Mapping[str, tuple[float, float]]) -> float:
+def _max_cubic_fraction(problem: ScaledRecords, parameters: Mapping[str, tuple[float, float]]) -> float:
     """The largest cubic force, relative to the linear force, within two standard deviations of b."""
     largest = 3 * problem.displacement * problem.scales.displacement
     (a, _), (b, std) = parameters["a"], parameters["b"]
     return (abs(b) + 2 * std) * largest**2 / abs(a)
 
 
-def _stds_from_records_alone(problem: IdentificationProblem, search_result: SearchResult) -> dict[str, float]:
+def _stds_from_records_alone(problem: ScaledRecords, search_result: SearchResult) -> dict[str, float]:
     """Relative standard deviations of m, c, a and b from the records alone, without the prior."""
     model, mean, cov = problem.rig.model, search_result.mean, search_result.cov
     scale = np.sqrt(np.diag(cov))

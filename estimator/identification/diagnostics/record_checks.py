@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator.identification.data.record import Record
 from estimator.identification.diagnostics.check_finding import CheckFinding
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.rigs.channel import Channel
 from estimator.rigs.rig import Rig
 
@@ -37,7 +37,7 @@ MIN_SAMPLES_PER_PERIOD = 5.0
 RECOMMENDED_SAMPLES_PER_PERIOD = 6
 
 
-def check_records(problem: IdentificationProblem, records: Sequence[Record]) -> list[CheckFinding]:
+def check_records(problem: ScaledRecords, records: Sequence[Record]) -> list[CheckFinding]:
     """Findings about the recorded signals alone.
 
     Args:

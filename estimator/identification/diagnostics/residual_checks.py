@@ -8,8 +8,8 @@ import numpy as np
 
 from estimator.identification.data.record import Record
 from estimator.identification.diagnostics.check_finding import CheckFinding
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.support.array_types import FloatArray
 
 
@@ -30,7 +30,7 @@ _FALSE_ALARM_PROBABILITY = 1e-4
 
 
 def check_residuals(
-    problem: IdentificationProblem, records: Sequence[Record], forecasts: Sequence[FloatArray]
+    problem: ScaledRecords, records: Sequence[Record], forecasts: Sequence[FloatArray]
 ) -> list[CheckFinding]:
     """Findings about forecast errors that are not white or not normal.
 

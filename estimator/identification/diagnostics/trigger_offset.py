@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.identification.fitting.weak_form import delay_misfits
-from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
+from estimator.identification.likelihood.scaled_records import MAX_UNSTATED_DELAY, ScaledRecords
 from estimator.rigs.rig import MAX_DELAY
 
 #: Longest delay that is tried, as a fraction of the shortest record.
@@ -24,7 +24,7 @@ _MAX_MISFIT_TO_STATED = 0.5
 _MAX_MISFIT_TO_MEDIAN = 0.9
 
 
-def find_trigger_offset(problem: IdentificationProblem) -> int | None:
+def find_trigger_offset(problem: ScaledRecords) -> int | None:
     """Samples by which the input acts later than the rig says; negative where the output responds early.
 
     None where no other delay is far better, or where the misfit has no sharp minimum.

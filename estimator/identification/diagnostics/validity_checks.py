@@ -25,12 +25,12 @@ from estimator.identification.diagnostics.guess_checks import (
     is_shifted_by_guess,
 )
 from estimator.identification.diagnostics.identifiability_checks import check_identifiability
-from estimator.identification.diagnostics.input_path_checks import MIN_EVIDENCE, check_input_path
+from estimator.identification.diagnostics.input_timing_checks import MIN_EVIDENCE, check_input_path
 from estimator.identification.diagnostics.record_checks import check_records
 from estimator.identification.diagnostics.residual_checks import check_residuals
 from estimator.identification.fitting.ridge_posterior import RidgePosterior
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.support.array_types import FloatArray
 
 #: Relative forecast error below which no check of the noise runs: a simulated record without noise leaves the errors
@@ -39,7 +39,7 @@ _MIN_JUDGED_ERROR = 1e-6
 
 
 def run_all_checks(
-    problem: IdentificationProblem,
+    problem: ScaledRecords,
     search_result: SearchResult,
     ridges: RidgePosterior | None,
     belief: Belief,

@@ -19,9 +19,9 @@ from estimator.identification.likelihood.fit_hypothesis import (
     CoefficientPrior,
     LaplaceFits,
 )
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.rigs.rig_prior import rig_prior
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import ProgressCallback
@@ -64,7 +64,7 @@ _MIN_LOG_NOISE_CHANGE = 0.05
 _MIN_NOISE_CHANGE_STDS = 6.0
 
 
-def coefficient_prior(problem: IdentificationProblem) -> CoefficientPrior:
+def coefficient_prior(problem: ScaledRecords) -> CoefficientPrior:
     """The prior of the coefficients: the rig's guess, or a wide one without a guess."""
     if problem.rig.guess is None:
         natural = problem.natural_coefficient_sizes()
@@ -77,7 +77,7 @@ def coefficient_prior(problem: IdentificationProblem) -> CoefficientPrior:
     return CoefficientPrior.of(*problem.moments_about_origin(guess.coefficients_mean, guess.coefficients_cov))
 
 
-def search_coefficients(problem: IdentificationProblem, on_progress: ProgressCallback) -> SearchResult:
+def search_coefficients(problem: ScaledRecords, on_progress: ProgressCallback) -> SearchResult:
     """Find the coefficients and the noises, for the rig's interpolation and delay.
 
     Args:
@@ -148,7 +148,7 @@ def _settle_best_start(fitter: LaplaceFitter, start_fits: LaplaceFits) -> Search
     return result
 
 
-def _noise_scales_changed(problem: IdentificationProblem, noise_scales: FloatArray) -> bool:
+def _noise_scales_changed(problem: ScaledRecords, noise_scales: FloatArray) -> bool:
     """Whether the noises of some records differ from the assumed ones, significantly and by enough to matter."""
     before = np.ones(len(noise_scales)) if problem.record_noise_scales is None else problem.record_noise_scales
     n_observed = np.array([np.isfinite(y).sum() for y in problem.y])
@@ -178,7 +178,7 @@ def _initial_states_changed(result: SearchResult) -> bool:
     return not np.isclose(before, after, rtol=0.0, atol=_MIN_STATE_CHANGE_NATS)
 
 
-def required_substeps(problem: IdentificationProblem, mean: FloatArray, cov: FloatArray) -> int:
+def required_substeps(problem: ScaledRecords, mean: FloatArray, cov: FloatArray) -> int:
     """The fewest substeps with a tolerable integration error, for coefficients (K,) with a covariance (K, K).
 
     In a step of the phase z = ω/n, the Runge-Kutta method of order 4 turns by z⁵/120 too little and loses z⁶/144 of

@@ -12,12 +12,12 @@ from estimator.belief import Belief
 from estimator.identification.fitting.noise_ratio_fit import fit_noise_ratio
 from estimator.identification.fitting.search_result import SearchResult
 from estimator.identification.likelihood.fit_hypothesis import CoefficientPrior, FitHypothesis
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.inference.noise_grid import moment_matched_gamma
-from estimator.inference.record_filter import filter_records
+from estimator.inference.record_filter import record_likelihoods
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import belief_from_moments
@@ -56,7 +56,7 @@ ContractionHistory: TypeAlias = tuple[ContractionStep, ...]
 
 
 def posterior_belief(
-    problem: IdentificationProblem, search_result: SearchResult
+    problem: ScaledRecords, search_result: SearchResult
 ) -> tuple[Belief, dict[str, tuple[float, float]]]:
     """The posterior of the rig's model, and ``input`` and ``output`` to mean and standard deviation of the noise.
 
@@ -92,7 +92,7 @@ def _unit_noise_force(belief: Belief) -> float:
     return float(belief.scales.input * np.sqrt(3) / abs(gain))
 
 
-def _with_initial_state_cov(belief: Belief, problem: IdentificationProblem) -> FloatArray:
+def _with_initial_state_cov(belief: Belief, problem: ScaledRecords) -> FloatArray:
     """The covariance with an unknown state, anywhere in the motion of the records."""
     cov, n = belief.cov, belief.model.n_states
     cov[:n, :n] = problem.initial_state_cov + (cov[:n, :n] - np.diag(np.diag(cov[:n, :n])))
@@ -122,7 +122,7 @@ def one_step_forecasts(
     noises = problem.noises_of_records(belief.noises[None, 1::2] / belief.noises[None, ::2])
     forecasts = np.empty((*outputs.shape, 2))
     points = np.tile(search_result.mean, (len(inputs), 1))
-    filter_records(
+    record_likelihoods(
         problem.model,
         points,
         inputs,
@@ -147,7 +147,7 @@ def _mixture_std(weights: FloatArray, values: FloatArray, shapes: FloatArray) ->
 
 
 def contraction_history(
-    problem: IdentificationProblem, search_result: SearchResult, parameters: dict[str, tuple[float, float]]
+    problem: ScaledRecords, search_result: SearchResult, parameters: dict[str, tuple[float, float]]
 ) -> ContractionHistory:
     """The parameters after growing first parts of every record: halves of halves, a quarter, a half, and all.
 
@@ -196,7 +196,7 @@ def refit_coefficients(
     start, cov = initial_belief.coefficients_mean, initial_belief.coefficients_cov
     u = tuple(inputs / initial_belief.scales.input for inputs, _ in records)
     y = tuple(mask_unexplained_outputs(outputs, rig) / initial_belief.scales.output for _, outputs in records)
-    problem = IdentificationProblem(rig, initial_belief.scales, u, y, substeps=_REFIT_SUBSTEPS)
+    problem = ScaledRecords(rig, initial_belief.scales, u, y, substeps=_REFIT_SUBSTEPS)
     if list(problem.model.coefficients) != list(initial_belief.model.coefficients):
         return start, cov
     q, r = initial_belief.noises[1] / initial_belief.noises[0], initial_belief.noises[3] / initial_belief.noises[2]

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.likelihood.fit_hypothesis import LaplaceFits
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.rigs.physical_parameters import physical_jacobian, to_physical
 from estimator.support.array_types import FloatArray
 
@@ -63,7 +63,7 @@ _MIN_STEP_STDS = 0.02
 class ParameterMap:
     """The map from the coefficients of a fit to the parameters of the rig's model, in the rig's units."""
 
-    def __init__(self, problem: IdentificationProblem) -> None:
+    def __init__(self, problem: ScaledRecords) -> None:
         self.model, self.scales, k = problem.rig.model, problem.scales, problem.model.n_coefficients
         none = np.zeros((k, k))
         self._offset = problem.moments_about_zero(np.zeros(k), none)[0]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
 from estimator.identification.likelihood.problem_signals import interpolate_gaps
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.support.array_types import FloatArray
 
@@ -52,14 +52,14 @@ _MAX_RANDOM_SIZE = 2.0
 _RANDOM_COEFFICIENTS = ("gain", "damping", "stiffness", "cubic")
 
 
-def _whole_delay_inputs(problem: IdentificationProblem) -> FloatArray:
+def _whole_delay_inputs(problem: ScaledRecords) -> FloatArray:
     """(T, rows) inputs with the nearest integer delay; only a held input may act a whole sample early."""
     rig = problem.rig
     least = -1 if rig.interpolation == "zero_order" else 0
     return problem.filter_samples(rig.interpolation, max(round(rig.delay), least)).inputs
 
 
-def weak_form_starts(problem: IdentificationProblem) -> list[FloatArray]:
+def weak_form_starts(problem: ScaledRecords) -> list[FloatArray]:
     """Starting coefficients (K,), one set for each width of the test functions and each high-pass.
 
     Where the outputs have an origin, there is also one set for each possible inflection of the spring: the origin, 0,
@@ -102,7 +102,7 @@ def weak_form_starts(problem: IdentificationProblem) -> list[FloatArray]:
     return coefficient_sets
 
 
-def random_starts(problem: IdentificationProblem, count: int, seed: int) -> list[FloatArray]:
+def random_starts(problem: ScaledRecords, count: int, seed: int) -> list[FloatArray]:
     """Random starting coefficients (K,) of all sizes and signs, for records at which `weak_form_starts` fail.
 
     A spring with negative stiffness hardens, because nothing else would hold the oscillator.
@@ -130,12 +130,12 @@ def random_starts(problem: IdentificationProblem, count: int, seed: int) -> list
     return coefficient_sets
 
 
-def input_effect_rms(problem: IdentificationProblem, coefficients: FloatArray) -> float:
+def input_effect_rms(problem: ScaledRecords, coefficients: FloatArray) -> float:
     """Root mean square effect of the inputs on the motion at coefficients (K,), in the unit of the process noise."""
     return abs(float(coefficients[list(problem.model.coefficients).index("gain")])) * problem.input_rms
 
 
-def _spring_centres(problem: IdentificationProblem) -> list[float]:
+def _spring_centres(problem: ScaledRecords) -> list[float]:
     """Possible inflections of the spring, from the origin of the outputs; 0 alone where they have no origin."""
     if not problem.origin:
         return [0.0]
@@ -143,7 +143,7 @@ def _spring_centres(problem: IdentificationProblem) -> list[float]:
     return sorted({0.0, -problem.origin, stated_offset - problem.origin})
 
 
-def delay_misfits(problem: IdentificationProblem, delays: NDArray[np.intp]) -> FloatArray:
+def delay_misfits(problem: ScaledRecords, delays: NDArray[np.intp]) -> FloatArray:
     """Relative residuals of the weak-form acceleration for each delay, the lowest over several widths.
 
     Only the input's column depends on the delay; the other columns are projected out once.
@@ -202,7 +202,7 @@ class _WeakFormEquations(NamedTuple):
 
 
 def _clean_equations(
-    problem: IdentificationProblem, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
+    problem: ScaledRecords, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
 ) -> FloatArray | None:
     """(n, 7) the clean rows of `_WeakFormEquations`; None for a record that is too short."""
     found = _weak_form_equations(problem, inputs, y, half_width, high_pass_periods)
@@ -210,7 +210,7 @@ def _clean_equations(
 
 
 def _weak_form_equations(
-    problem: IdentificationProblem, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
+    problem: ScaledRecords, inputs: FloatArray, y: FloatArray, half_width: int, high_pass_periods: float
 ) -> _WeakFormEquations | None:
     """The weak-form equations of a record; None for a record that is too short."""
     count = len(y)

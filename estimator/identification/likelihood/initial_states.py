@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
-from estimator.identification.likelihood.identification_problem import IdentificationProblem
-from estimator.inference.record_filter import filter_records
+from estimator.identification.likelihood.scaled_records import ScaledRecords
+from estimator.inference.record_filter import record_likelihoods
 from estimator.support.array_types import FloatArray
 
 #: Displacements, and velocities, in the grid of initial states.
@@ -54,7 +54,7 @@ _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]]
 
 
 def find_initial_states(
-    problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, sensor_std: float
+    problem: ScaledRecords, hypothesis: FitHypothesis, points: FloatArray, sensor_std: float
 ) -> FloatArray:
     """The most probable displacement and velocity one sample before each record.
 
@@ -113,7 +113,7 @@ def _newton_step(stencil_losses: FloatArray) -> FloatArray:
 
 
 def _initial_state_loss(
-    problem: IdentificationProblem, hypothesis: FitHypothesis, points: FloatArray, cov: FloatArray
+    problem: ScaledRecords, hypothesis: FitHypothesis, points: FloatArray, cov: FloatArray
 ) -> Callable[[FloatArray, float], FloatArray]:
     """A function from initial states (C, S, 2) and σ_v to negative log likelihoods (C, S).
 
@@ -126,7 +126,7 @@ def _initial_state_loss(
     def losses(candidates: FloatArray, sensor: float) -> FloatArray:
         count, series = candidates.shape[:2]
         times = count * series // len(inputs)
-        loss = filter_records(
+        loss = record_likelihoods(
             problem.model,
             np.tile(at, (count, 1)),
             np.tile(inputs, (times, 1, 1)),
@@ -141,7 +141,7 @@ def _initial_state_loss(
     return losses
 
 
-def well_displacements(problem: IdentificationProblem, coefficients: FloatArray) -> FloatArray:
+def well_displacements(problem: ScaledRecords, coefficients: FloatArray) -> FloatArray:
     """(n, P) displacements of the two wells of the spring at coefficients (P, K), from its inflection.
 
     Empty where no spring has two wells; 0 for each spring that has one.

@@ -30,8 +30,8 @@ from estimator.identification.likelihood.fit_hypothesis import (
     FitHypothesis,
     LaplaceFits,
 )
-from estimator.identification.likelihood.identification_problem import FilterSamples, IdentificationProblem
-from estimator.inference.record_filter import FilteredRecords, filter_records
+from estimator.identification.likelihood.scaled_records import FilterSamples, ScaledRecords
+from estimator.inference.record_filter import RecordLikelihoods, record_likelihoods
 from estimator.support.array_types import FloatArray
 
 #: Levenberg-Marquardt damping at the start of a fit.
@@ -105,12 +105,12 @@ class LaplaceFitter:
         prior: prior of the coefficients.
     """
 
-    def __init__(self, problem: IdentificationProblem, prior: CoefficientPrior) -> None:
+    def __init__(self, problem: ScaledRecords, prior: CoefficientPrior) -> None:
         self.problem, self.prior = problem, prior
         self._scale = 1 / np.sqrt(np.diag(prior.precision))
         self._samples: dict[tuple[str, float, float], FilterSamples] = {}
 
-    def for_problem(self, problem: IdentificationProblem) -> LaplaceFitter:
+    def for_problem(self, problem: ScaledRecords) -> LaplaceFitter:
         """A fitter of another problem, with the same prior."""
         return LaplaceFitter(problem, self.prior)
 
@@ -238,11 +238,13 @@ class LaplaceFitter:
             np.where(bad, sensor_stds, sensor_stds * np.sqrt(np.where(bad, 1.0, excess))),
         )
 
-    def _run_filter(self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray) -> FilteredRecords:
+    def _run_filter(
+        self, points: FloatArray, filter_inputs: _FilterInputs, sensor_stds: FloatArray
+    ) -> RecordLikelihoods:
         """The filter's results for all records at each of the points (H, K)."""
         problem, records = self.problem, len(self.problem.u)
         inputs = filter_inputs.inputs[filter_inputs.input_path_index]
-        return filter_records(
+        return record_likelihoods(
             problem.model,
             np.repeat(points, records, axis=0),
             inputs.reshape(-1, *inputs.shape[2:]),

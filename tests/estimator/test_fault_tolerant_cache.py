@@ -13,7 +13,7 @@ from typing import ClassVar
 import pytest
 from numba.core import event
 
-from estimator.compilation import disk_cache
+from estimator.compilation import fault_tolerant_cache
 from estimator.engine import source_cache as generated
 
 SOURCE = """
@@ -37,12 +37,12 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "run_of_compiled.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
-    disk_cache.cache_folder.cache_clear()
-    disk_cache._warn_damaged.cache_clear()
+    fault_tolerant_cache.cache_folder.cache_clear()
+    fault_tolerant_cache._warn_damaged.cache_clear()
     yield tmp_path / "compiled"
     sys.modules.pop("run_of_compiled", None)
-    disk_cache.cache_folder.cache_clear()
-    disk_cache._warn_damaged.cache_clear()
+    fault_tolerant_cache.cache_folder.cache_clear()
+    fault_tolerant_cache._warn_damaged.cache_clear()
 
 
 def fresh():
@@ -147,12 +147,12 @@ def test_where_nothing_can_be_written_it_runs_with_one_warning(place, tmp_path, 
 
 
 def test_a_folder_that_becomes_read_only_costs_nothing_but_time(place, monkeypatch):
-    assert disk_cache.cache_folder() == place
+    assert fault_tolerant_cache.cache_folder() == place
 
     def refuse(*args, **kwargs):
         raise PermissionError("read-only file system")
 
-    monkeypatch.setattr(disk_cache.tempfile, "mkstemp", refuse)
+    monkeypatch.setattr(fault_tolerant_cache.tempfile, "mkstemp", refuse)
     assert called() == (42, 0)
     assert loaded()[0] == 1
     assert not list(place.iterdir())
@@ -163,10 +163,10 @@ def test_a_user_without_a_home_gets_no_folder_called_tilde(tmp_path, monkeypatch
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)
     monkeypatch.chdir(tmp_path)
-    disk_cache.cache_folder.cache_clear()
+    fault_tolerant_cache.cache_folder.cache_clear()
     with pytest.warns(RuntimeWarning, match="no folder can be written"):
-        assert disk_cache.cache_folder() is None
-    disk_cache.cache_folder.cache_clear()
+        assert fault_tolerant_cache.cache_folder() is None
+    fault_tolerant_cache.cache_folder.cache_clear()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 
@@ -237,7 +237,7 @@ class Timer:
 
 def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
     monkeypatch.setattr(Timer, "asked", [])
-    watching = disk_cache.CompilationNotice(now=itertools.count(0.0, 1.5).__next__, timer=Timer)
+    watching = fault_tolerant_cache.CompilationNotice(now=itertools.count(0.0, 1.5).__next__, timer=Timer)
     event.register("numba:compile", watching)
     try:
         assert called() == (42, 0)
@@ -254,7 +254,7 @@ def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
 def test_what_took_longer_than_the_timer_could_say_is_said_of_the_next(place, monkeypatch):
     """A timer that is late, as on a busy machine."""
     monkeypatch.setattr(Timer, "asked", [])
-    watching = disk_cache.CompilationNotice(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
+    watching = fault_tolerant_cache.CompilationNotice(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
     event.register("numba:compile", watching)
     try:
         assert called() == (42, 0)
@@ -276,6 +276,7 @@ def test_garbage_is_collected_again_after_compilation(place):
 
 
 def test_the_garbage_of_others_is_left_to_them():
-    text = "import gc, estimator.compilation.disk_cache, agents.commands; print(gc.get_freeze_count(), gc.isenabled())"
+    imports = "import gc, estimator.compilation.fault_tolerant_cache, agents.commands"
+    text = f"{imports}; print(gc.get_freeze_count(), gc.isenabled())"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "True"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from duffing_env.storage.random_streams import sfc64_next, to_uniform
+from duffing_env.storage.random_streams import sfc64_next, to_open_uniform
 from estimator.compilation.simd import jit
 
 #: Inputs to choose from, in parts of the largest. Later in a plan the first five are tried, then the first two.
@@ -128,4 +128,4 @@ def next_uniform(rng_state):
     value, rng_state[0], rng_state[1], rng_state[2], rng_state[3] = sfc64_next(
         rng_state[0], rng_state[1], rng_state[2], rng_state[3]
     )
-    return to_uniform(value)
+    return to_open_uniform(value)

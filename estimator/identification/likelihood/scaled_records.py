@@ -1,4 +1,4 @@
-"""`IdentificationProblem`: scaled records, and their samples for the filter under a hypothesis of the input path."""
+"""`ScaledRecords`: scaled records, and their samples for the filter under a hypothesis of the input path."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class FilterSamples(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class IdentificationProblem:
+class ScaledRecords:
     """The records of a rig, scaled, and the equation that they are fitted by.
 
     Attributes:
@@ -172,7 +172,7 @@ class IdentificationProblem:
         """Times of the samples of each record, in sampling steps."""
         return self.times or tuple(np.arange(len(u), dtype=np.float64) for u in self.u)
 
-    def resampled_evenly(self) -> IdentificationProblem:
+    def resampled_evenly(self) -> ScaledRecords:
         """The same with inputs and outputs interpolated to even steps, which is enough to find a start."""
         if self.times is None:
             return self
@@ -191,11 +191,11 @@ class IdentificationProblem:
         """The inverse of `moments_about_origin`."""
         return shift_output_origin(self.model, mean, cov, -self.origin)
 
-    def truncated(self, max_samples: int) -> IdentificationProblem:
+    def truncated(self, max_samples: int) -> ScaledRecords:
         """The same with the first ``max_samples`` samples of each record alone."""
         return self.with_segments([Segment(record, 0) for record in range(len(self.u))], max_samples)
 
-    def with_segments(self, segments: Sequence[Segment], max_samples: int) -> IdentificationProblem:
+    def with_segments(self, segments: Sequence[Segment], max_samples: int) -> ScaledRecords:
         """The same with segments in place of the records.
 
         Args:

@@ -9,7 +9,7 @@ from tables import table
 
 from agents.commands.train_command import main
 from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune_hyperparameters
-from agents.training.seed_runs import train_or_resume
+from agents.training.train_seeds import train_or_resume
 
 ENV = "duffing_env/Short-v0"
 TINY = PPOSettings(num_envs=8, n_steps=16, batch_size=64, hidden=(4,))
@@ -42,7 +42,7 @@ def test_each_seed_is_the_training_of_that_seed_alone(tmp_path, on_ray):
 def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     carried = []
     monkeypatch.setattr(
-        "agents.training.seed_runs.train_or_resume", lambda run: carried.append(run) or train_or_resume(run)
+        "agents.training.train_seeds.train_or_resume", lambda run: carried.append(run) or train_or_resume(run)
     )
     assert len(list(train_seeds(config(tmp_path), 1))) == 1
     before = (tmp_path / "0" / "policy.json").stat().st_mtime_ns

@@ -10,8 +10,8 @@ import numpy as np
 from estimator.identification.diagnostics.check_finding import CheckFinding
 from estimator.identification.fitting.search_result import SearchResult
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis
-from estimator.identification.likelihood.identification_problem import MAX_UNSTATED_DELAY, IdentificationProblem
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import MAX_UNSTATED_DELAY, ScaledRecords
 from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.rigs.rig import FRACTIONAL_DELAY_INTERPOLATIONS, MAX_DELAY
 from estimator.support.array_types import FloatArray
@@ -55,7 +55,7 @@ _SCREENING_SAMPLES = 1024
 _SCREENING_LOSS = 10.0
 
 
-def check_input_path(problem: IdentificationProblem, search_result: SearchResult) -> list[CheckFinding]:
+def check_input_path(problem: ScaledRecords, search_result: SearchResult) -> list[CheckFinding]:
     """A finding where the records speak for another path of the input than the rig states.
 
     Args:
@@ -105,7 +105,7 @@ def check_input_path(problem: IdentificationProblem, search_result: SearchResult
 
 
 def _best_alternative(
-    problem: IdentificationProblem, search_result: SearchResult, hypotheses: Sequence[FitHypothesis], baseline: float
+    problem: ScaledRecords, search_result: SearchResult, hypotheses: Sequence[FitHypothesis], baseline: float
 ) -> tuple[FitHypothesis, float] | None:
     """The best of some hypotheses and its gain in nats; None where no rig may have any of them."""
     hypotheses = _screen_hypotheses(problem, search_result, [other for other in hypotheses if _is_allowed(other)])
@@ -123,7 +123,7 @@ def _is_allowed(hypothesis: FitHypothesis) -> bool:
 
 
 def _refine_delay_and_lag(
-    problem: IdentificationProblem, search_result: SearchResult, hypothesis: FitHypothesis, gain: float, baseline: float
+    problem: ScaledRecords, search_result: SearchResult, hypothesis: FitHypothesis, gain: float, baseline: float
 ) -> tuple[FitHypothesis, float]:
     """A hypothesis with a fractional delay and a lag, where these are better than whole samples; and its gain."""
     paths = [*FRACTIONAL_DELAY_INTERPOLATIONS[:2], *(["spline"] if _is_input_smooth(problem) else [])]
@@ -154,7 +154,7 @@ def _refine_delay_and_lag(
     return final, refined[1]
 
 
-def _is_input_smooth(problem: IdentificationProblem) -> bool:
+def _is_input_smooth(problem: ScaledRecords) -> bool:
     """Whether inputs change gently from sample to sample, as after a filter or an amplifier."""
     second_differences = np.concatenate([np.diff(u, 2) for u in problem.u])
     first_differences = np.concatenate([np.diff(u) for u in problem.u])
@@ -163,7 +163,7 @@ def _is_input_smooth(problem: IdentificationProblem) -> bool:
     return bool(not is_held and np.sqrt(np.mean(second_differences**2)) < _MAX_ROUGHNESS * problem.input_rms)
 
 
-def _input_path_finding(problem: IdentificationProblem, alternative: FitHypothesis, gain: float) -> CheckFinding:
+def _input_path_finding(problem: ScaledRecords, alternative: FitHypothesis, gain: float) -> CheckFinding:
     rig = problem.rig
     name = "interpolation" if alternative.interpolation != rig.interpolation else "delay"
     lag = f", and a lag of {alternative.lag * rig.step:.3g} s" if alternative.lag else ""
@@ -182,7 +182,7 @@ def _input_path_finding(problem: IdentificationProblem, alternative: FitHypothes
 
 
 def _screen_hypotheses(
-    problem: IdentificationProblem, search_result: SearchResult, hypotheses: list[FitHypothesis]
+    problem: ScaledRecords, search_result: SearchResult, hypotheses: list[FitHypothesis]
 ) -> list[FitHypothesis]:
     """The hypotheses that fit the first part of the records; all of them, where that is no small part."""
     shortened = problem.truncated(_SCREENING_SAMPLES)

@@ -31,7 +31,7 @@ _COARSE_SUBSTEPS = 2
 
 
 @dataclass(frozen=True)
-class NoiseFreeResponse:
+class NoiseFreeStep:
     """The noise-free response of a model, for the systems of a block ``W`` (`estimator.compilation.simd`).
 
     The input of a sample is in row ``INPUT``. Older inputs, if the model has them, are in ``LAST_INPUT`` and
@@ -63,7 +63,7 @@ def with_coarse_substeps(model: Model) -> Model:
 
 
 @cache
-def compile_noise_free_response(model: Model, degree: int = 0, lag: int = 0, lanes: int = 1) -> NoiseFreeResponse:
+def compile_noise_free_step(model: Model, degree: int = 0, lag: int = 0, lanes: int = 1) -> NoiseFreeStep:
     """Compile the noise-free response of a model.
 
     Args:
@@ -81,7 +81,7 @@ def compile_noise_free_response(model: Model, degree: int = 0, lag: int = 0, lan
     code = load_generated(
         model.name, "motion", key, lambda: _source(coarse, degree, lag, lanes, layout), RUNTIME_FUNCTIONS
     )
-    return NoiseFreeResponse(
+    return NoiseFreeStep(
         code.output_now, code.output_after, code.step, code.regressors, code.linearise, layout, code.IS_ODD
     )
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import datasets
-from agents.datasets import Config, collect_episodes, main
+from agents import minari_datasets
 from agents.evaluation.track_batch import make_track_batch
+from agents.minari_datasets import Config, collect_episodes, main
 
 ROOT = Path(__file__).parents[2]
 SHORT = "duffing_env/Short-v0"
@@ -54,7 +54,7 @@ def test_a_dataset_is_not_replaced(tmp_path, monkeypatch):
     """What is there is found before anything is played."""
     pytest.importorskip("minari", reason="minari is not installed; it is the extra datasets")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.setattr(datasets, "collect_episodes", lambda config: pytest.fail("it is refused before"))
+    monkeypatch.setattr(minari_datasets, "collect_episodes", lambda config: pytest.fail("it is refused before"))
     (tmp_path / "duffing/short-v0/random-v0").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"random-v0 must be a new dataset, but is in .*random-v0; delete that folder"):
         main(Config("random", "Short-v0"))

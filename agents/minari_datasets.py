@@ -1,7 +1,7 @@
 """Datasets for offline learning, in Minari's format: episodes of policies of four grades on a track.
 
-$ python -m agents.datasets --grade random
-$ python -m agents.datasets --grade expert --env Amplitude-v0 --episodes 5000
+$ python -m agents.minari_datasets --grade random
+$ python -m agents.minari_datasets --grade expert --env Amplitude-v0 --episodes 5000
 
 A dataset is called duffing/TRACK/GRADE-v0, and lies where Minari keeps its own (MINARI_DATASETS_PATH). Its systems are
 of the branch ``train`` of the seeds, so what learns from it has met none of those that it is evaluated on.
@@ -21,7 +21,7 @@ from agents.console_output import print_texts_and_tables
 from agents.evaluation.comparison import default_policies
 from agents.evaluation.track_batch import make_track_batch
 from agents.policies import make_policy, trained_policies
-from agents.track_ids import check_track_id, full_track_id
+from agents.track_ids import check_is_duffing_track, full_track_id
 from agents.user_code import attribute_user_errors
 from estimator.support.argument_checks import check_choice, check_integer
 from estimator.support.optional_dependencies import require_packages
@@ -51,7 +51,7 @@ class Config:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env", full_track_id(self.env))
-        check_track_id(self.env)
+        check_is_duffing_track(self.env)
         check_choice("grade", self.grade, (*POLICIES, "expert"))
         check_integer("episodes", self.episodes, _MAX_EPISODES)
         check_integer("seed", self.seed, 2**32 - 1, 0)
