@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from duffing_env.experiment_config import Experiment
 from duffing_env.kernel import RESET_ONLY, compile_kernel
-from duffing_env.kernel_stages.noise_filter_bank import interleave_width, n_member_blocks
+from duffing_env.kernel_stages.noise_filter_bank import interleave_width, member_row_count, n_member_blocks
 from duffing_env.storage.array_pool import ArrayPool
 from duffing_env.storage.kernel_spec import (
     OUTCOME_ROWS,
@@ -88,7 +88,7 @@ class Batch:
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
         self._flat_blocks = self._blocks.reshape(n_blocks, -1)
         n_members = n_member_blocks(size, len(self._params.hypothesis_priors))
-        self._members = np.zeros((n_members, (record_size(experiment.model) + 1) * LANES))
+        self._members = np.zeros((n_members, member_row_count(self._spec) * LANES))
         self._ended = np.zeros_like(self._blocks)
         self._flat_ended = self._ended.reshape(n_blocks, -1)
         self._workspace = np.zeros((threads, 2 * n_rows * LANES))
@@ -257,7 +257,7 @@ class Batch:
         slots = block * n_member_blocks(n, count) * LANES + np.arange(count) * n + lane
         rows = self._members.reshape(len(self._members), -1, LANES).swapaxes(1, 2)
         members = rows[slots // LANES, slots % LANES]
-        return members[:, :-1].copy(), members[:, -1].copy()
+        return members[:, :-2].copy(), members[:, -2].copy()
 
     def belief(self, index: int) -> Belief:
         """The belief of environment ``index``."""

@@ -24,22 +24,22 @@ from dataclasses import replace
 
 import sympy as sp
 
-from estimator.engine.noise_iterations import iterate_noise_beliefs
-from estimator.engine.printer_numba import print_expression
+from estimator.engine.noise_iterations import iterate_noise_beliefs, sensor_free_energy
+from estimator.engine.printer_numba import is_numeral, print_expression
+from estimator.engine.psd_projection import project_to_psd
 from estimator.engine.symbolic import (
     ONE,
     ZERO,
     Assignments,
     Program,
     Propagation,
-    clip,
     differentiate,
     input_at_end,
     is_present,
-    positive_part,
     select,
     symbol,
     symmetric_entry,
+    zero_if_finite,
 )
 from estimator.models.model import Model
 
@@ -61,7 +61,7 @@ class GaussianUpdate:
         self.lines = Program()
         self.assign = self.lines.assign
         if not propagation.is_psd:
-            self.propagation = replace(propagation, noise_cov=self._project_to_psd(propagation.noise_cov))
+            self.propagation = replace(propagation, noise_cov=project_to_psd(self.lines, propagation.noise_cov))
         self.mean: dict[str, sp.Expr] = {
             **dict(zip(self.states, propagation.state, strict=True)),
             **{c: symbol(c) for c in model.coefficients},
@@ -73,39 +73,6 @@ class GaussianUpdate:
     def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
         i, j = key
         return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
-
-    def _project_to_psd(self, noise_cov: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
-        """N if it is positive semi-definite; else its variances, with the covariances clipped to the range they allow.
-
-        The integrated N is wrong where the Jacobian of the rates exceeds about 3 per step, and may then be indefinite.
-        """
-        n = len(noise_cov)
-        entries = {(a, b): noise_cov[a][b] for a in range(n) for b in range(a, n)}
-        for a in range(n):
-            entries[a, a] = self.assign(f"Q_PSD_{a}_{a}", positive_part(entries[a, a]))
-        remaining = dict(entries)  # the Schur complement
-        for a in range(n - 1):
-            for b in range(a + 1, n):
-                largest = self.assign(
-                    f"Q_LIMIT_{a}_{b}",
-                    sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b])),
-                )
-                clipped = self.assign(f"Q_CLIPPED_{a}_{b}", clip(remaining[a, b], -largest, largest))
-                entries[a, b] = (
-                    self.assign(f"Q_PSD_{a}_{b}", entries[a, b] + (clipped - remaining[a, b])) if a else clipped
-                )
-                remaining[a, b] = clipped
-            inverse = (
-                self.assign(f"PIVOT_INVERSE_{a}", 1 / select(remaining[a, a], remaining[a, a], ONE))
-                if a < n - 2
-                else ZERO
-            )
-            for b in range(a + 1, n if a < n - 2 else 0):
-                for c in range(b, n):
-                    remaining[b, c] = self.assign(
-                        f"SCHUR_{a}_{b}_{c}", remaining[b, c] - remaining[a, b] * remaining[a, c] * inverse
-                    )
-        return tuple(tuple(entries[min(a, b), max(a, b)] for b in range(n)) for a in range(n))
 
     def _predict(self) -> None:
         """Q = S P Sᵀ in the states' rows, or the given ``Q_i_j`` if there is no S; the coefficients' block stays."""
@@ -239,7 +206,13 @@ class GaussianUpdate:
 
 
 def belief_update(
-    model: Model, propagation: Propagation, degree: int, iterations: int, keep_trace: bool, may_be_missing: bool
+    model: Model,
+    propagation: Propagation,
+    degree: int,
+    iterations: int,
+    keep_trace: bool,
+    may_be_missing: bool,
+    free_energies: Sequence[int] = (),
 ) -> tuple[Assignments, dict[str, str]]:
     """Update the belief by the outputs ``Y_<sensor>``, with the noises: assignments and results by row.
 
@@ -250,9 +223,12 @@ def belief_update(
         iterations: variational iterations.
         keep_trace: write the terms of every iteration's free energy into rows ``TRACE_<number of the sensor>_<term>``.
         may_be_missing: an output that is NaN is missing: the state is predicted, and nothing is updated.
+        free_energies: iterations whose free energy [nats] goes into the row ``FREE_ENERGY_<iteration>``, NaN where the
+            belief is not finite.
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}
+    totals: dict[int, sp.Expr] = dict.fromkeys(free_energies, ZERO)
     informative_sensor = [
         k for k in range(model.n_outputs) if g.output_process_noise(g.predicted_output(k, degree)[1]) != 0
     ][:1]
@@ -268,6 +244,9 @@ def belief_update(
         e = g.assign(f"INNOVATION{tag}", select(is_observed, y - expected, ZERO) if may_be_missing else y - expected)
         noise_iterations = iterate_noise_beliefs(g.lines, tag, sensor, (s, e, output_noise, is_observed), iterations)
         last = noise_iterations[-1]
+        for i in free_energies:
+            scalars = s, e, output_noise, is_observed
+            totals[i] += sensor_free_energy(g.lines, f"{tag}_{i}", sensor, scalars, noise_iterations[i])
         if output_noise != 0:
             noise_cross_cov = {i: sum((output_slope[b] * n for b, n in enumerate(row)), ZERO)
                      for i, row in zip(g.states, g.propagation.noise_cov, strict=True)}  # fmt: skip
@@ -298,7 +277,13 @@ def belief_update(
             for i, one in enumerate(noise_iterations):
                 traced |= {f"q_{i}": one.q, f"r_{i}": one.r}
             results |= {f"TRACE_{tag}_{what}": print_expression(value) for what, value in traced.items()}
-    return g.lines, results | g.row_results()
+    results |= g.row_results()
+    if totals:
+        values = [symbol(value) for value in results.values() if not is_numeral(value)]
+        invalid = zero_if_finite(g.assign("SUM_OF_BELIEF", sum(values, ZERO)))
+        for i, total in totals.items():
+            results[f"FREE_ENERGY_{i}"] = print_expression(g.assign(f"FREE_ENERGY_{i}_E", total + invalid))
+    return g.lines, results
 
 
 def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:

@@ -1,12 +1,14 @@
-"""Mean and covariance of mixtures of beliefs, compiled for several systems at once.
+"""Mean and covariance of mixtures of beliefs, compiled for several systems at once, in one pass over the members.
 
-With shares s_m, means x_m and covariances P_m, and x* the mean of one of the members,
+With weights s_m, means x_m, covariances P_m, and the deviations d_m = x_m - x* from one of the members,
 
-    x = x* + Σ_m s_m (x_m - x*),   P = Σ_m s_m (P_m + (x_m - x)(x_m - x)ᵀ):
+    x = x* + d,   d = Σ_m s_m d_m,   P = Σ_m s_m (P_m + d_m d_mᵀ) - d dᵀ:
 
 a mean that all members share keeps its bits. The Gamma densities of the precisions match mean V and variance of the
-noise variances. A member has the noise variance v_m = rate/shape, as in an update, with relative variance 1/shape; the
-mixture has the relative variance Σ_m s_m [(v_m/V)²/shape_m + (v_m/V - 1)²].
+noise variances. A member has the noise variance v_m = rate/shape, as in an update, with relative variance 1/shape. With
+a_m = v_m/v* - 1 and a = Σ_m s_m a_m,
+
+    V = v* (1 + a),   relative variance = (Σ_m s_m [(1 + a_m)²/shape_m + a_m²] - a²) / (1 + a)².
 """
 
 from __future__ import annotations
@@ -23,70 +25,71 @@ N_NOISES = 2
 
 
 class MomentSums(NamedTuple):
-    """Compiled sums over the members of mixtures, each for one member of n systems.
+    """Compiled sums over the members of mixtures, for several systems side by side.
 
     The members' records lie in lanes ``at`` to ``at + n`` of a block B, number i of a record in row i
-    (`estimator.Belief`), and their shares are S[s] to S[s + n]. A member without share adds nothing, whatever its
-    numbers. The mixtures' records lie in another block X, from lane 0 on.
+    (`estimator.Belief`), and their weights are S[s] to S[s + n]. A member without weight adds nothing, whatever its
+    numbers. Blocks A and X hold the reference and the mixture of each system, in the same rows, from lane 0 on.
 
     Attributes:
-        check: ``check(B, at, S, s, n)``: sets S to 0 where all numbers of the record are finite, else to NaN.
-        means: ``means(B, at, S, s, A, X, n)``: adds s (x - x*) to X, with x* in the rows of a block A.
-        spreads: ``spreads(B, at, S, s, X, n)``: adds s (P + (x - X)(x - X)ᵀ) and, in the rows of the rates, s v.
-        tails: ``tails(B, at, S, s, X, n)``: adds the noises' relative variances in the rows of the shapes.
+        add: ``add(B, at, S, s, A, X, n)``: adds one member of each of n systems to the sums in X. A holds x*, and 1/v*
+            in the rows of the rates.
+        finish: ``finish(A, X, n)``: turns the sums in X into the mixtures' records.
     """
 
-    check: Any
-    means: Any
-    spreads: Any
-    tails: Any
+    add: Any
+    finish: Any
 
 
 @cache
 def compile_mixture_moments(n_quantities: int) -> MomentSums:
     """Compile the sums for beliefs in ``n_quantities`` states and coefficients, of one sensor."""
     code = load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
-    return MomentSums(code.check, code.means, code.spreads, code.tails)
+    return MomentSums(code.add, code.finish)
 
 
 def _source(n_quantities: int) -> str:
     pairs = list(combinations_with_replacement(range(n_quantities), 2))
     shapes = [n_quantities + len(pairs) + 2 * k for k in range(N_NOISES)]
-    size = n_quantities + len(pairs) + 2 * N_NOISES
 
-    def member_entry(i: int) -> str:
+    def member(i: int) -> str:
         return f"B[{i * LANES} + at + LANE]"
 
-    def mixture_entry(i: int) -> str:
+    def reference(i: int) -> str:
+        return f"A[{i * LANES} + LANE]"
+
+    def total(i: int) -> str:
         return f"X[{i * LANES} + LANE]"
 
     def accumulate(i: int, term: str) -> str:
-        return f"{mixture_entry(i)} = {mixture_entry(i)} + ({term} if share > 0.0 else 0.0)"
+        return f"{total(i)} = {total(i)} + ({term} if share > 0.0 else 0.0)"
 
-    def loop(name: str, arguments: str, lines: list[str]) -> str:
-        head = f"@scalar_jit\ndef {name}(B, at, S, s, {arguments}n):\n    for LANE in range(n):\n"
+    def loop(signature: str, lines: list[str]) -> str:
+        head = f"@scalar_jit\ndef {signature}:\n    for LANE in range(n):\n"
         return head + "".join(f"        {line}\n" for line in lines)
 
-    share = "share = S[s + LANE]"
-    check = [f"S[s + LANE] = {' + '.join(f'0.0 * {member_entry(i)}' for i in range(size))}"]
-    means = [
-        share,
-        *(accumulate(i, f"share * ({member_entry(i)} - A[{i * LANES} + LANE])") for i in range(n_quantities)),
-    ]
-    spreads = [share, *(f"off_{i} = {member_entry(i)} - {mixture_entry(i)}" for i in range(n_quantities))]
-    spreads += [
-        accumulate(n_quantities + p, f"share * ({member_entry(n_quantities + p)} + off_{i} * off_{j})")
+    add = ["share = S[s + LANE]", *(f"d_{i} = {member(i)} - {reference(i)}" for i in range(n_quantities))]
+    add += [accumulate(i, f"share * d_{i}") for i in range(n_quantities)]
+    add += [
+        accumulate(n_quantities + p, f"share * ({member(n_quantities + p)} + d_{i} * d_{j})")
         for p, (i, j) in enumerate(pairs)
     ]
-    spreads += [accumulate(i + 1, f"share * ({member_entry(i + 1)} / {member_entry(i)})") for i in shapes]
-    tails = [share]
+    finish = [f"d_{i} = {total(i)}" for i in range(n_quantities)]
+    finish += [f"{total(i)} = {reference(i)} + d_{i}" for i in range(n_quantities)]
+    finish += [
+        f"{total(n_quantities + p)} = {total(n_quantities + p)} - d_{i} * d_{j}" for p, (i, j) in enumerate(pairs)
+    ]
     for k, i in enumerate(shapes):
-        tails += [
-            f"inverse_{k} = 1.0 / {member_entry(i)}",
-            f"away_{k} = {member_entry(i + 1)} * inverse_{k} / {mixture_entry(i + 1)} - 1.0",
-            accumulate(i, f"share * ((away_{k} + 1.0) * (away_{k} + 1.0) * inverse_{k} + away_{k} * away_{k})"),
+        add += [
+            f"inverse_{k} = 1.0 / {member(i)}",
+            f"a_{k} = {member(i + 1)} * inverse_{k} * {reference(i + 1)} - 1.0",
+            accumulate(i, f"share * ((1.0 + a_{k}) * (1.0 + a_{k}) * inverse_{k} + a_{k} * a_{k})"),
+            accumulate(i + 1, f"share * a_{k}"),
         ]
-    return (
-        loop("check", "", check) + loop("means", "A, X, ", means)
-        + loop("spreads", "X, ", spreads) + loop("tails", "X, ", tails)
-    )  # fmt: skip
+        finish += [
+            f"a_{k} = {total(i + 1)}",
+            f"shape_{k} = (1.0 + a_{k}) * (1.0 + a_{k}) / ({total(i)} - a_{k} * a_{k})",
+            f"{total(i)} = shape_{k}",
+            f"{total(i + 1)} = shape_{k} * (1.0 + a_{k}) / {reference(i + 1)}",
+        ]
+    return loop("add(B, at, S, s, A, X, n)", add) + loop("finish(A, X, n)", finish)

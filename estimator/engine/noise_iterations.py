@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import sympy as sp
 
-from estimator.engine.symbolic import HALF, ZERO, Program, symbol
+from estimator.compilation.elementary_functions import LOG_2PI
+from estimator.engine.symbolic import HALF, ONE, ZERO, Program, log1p, select, symbol, where_valid
 
 
 class NoiseIteration(NamedTuple):
@@ -104,3 +105,38 @@ def iterate_noise_beliefs(
         )
         r = program.assign(f"R{tag}_{i + 1}", new_xi_rate * inverse_xi_shape)
     return noise_iterations
+
+
+def sensor_free_energy(
+    program: Program, tag: str, sensor: str, scalars: tuple[sp.Expr, ...], iteration: NoiseIteration
+) -> sp.Expr:
+    """The free energy [nats] of a sensor's output after an iteration (`estimator.engine.variational_free_energy`).
+
+    The terms of a Gamma belief that depend on its shape alone are read from the symbols ``RATIO_<precision>`` and
+    ``TERM_<precision>``, r and t of `estimator.compilation.elementary_functions.gamma_half_ratio`.
+    """
+    s, e, output_noise, is_observed = scalars
+    weight, step = iteration.inverse_innovation_cov, iteration.scaled_innovation
+    variance = program.assign(f"S_TOTAL{tag}", s + iteration.q + iteration.r)
+    xi_rate = symbol(f"XI_RATE_{sensor}")
+    noises = [("XI", f"XI_{sensor}", iteration.r, symbol(f"XI_SHAPE_{sensor}"), xi_rate)]
+    if output_noise != 0:
+        rate = program.assign(f"GAMMA_RATE_OUTPUT{tag}", output_noise * symbol("GAMMA_RATE"))
+        noises.append(("GAMMA", "GAMMA", iteration.q, symbol("GAMMA_SHAPE"), rate))
+    factor, term, powers = variance, ZERO, {}
+    for name, precision, noise, shape, rate in noises:
+        half_power = program.assign(f"{name}_POWER{tag}", HALF * noise * (noise * step**2 + (1 - noise * weight)))
+        inverse = program.assign(f"{name}_PRECISION{tag}", 1 / noise)
+        ratio = program.assign(f"{name}_FACTOR{tag}", (rate + half_power) * inverse * symbol(f"RATIO_{precision}"))
+        divergence = program.assign(
+            f"{name}_DIVERGENCE{tag}",
+            shape * log1p(half_power / rate) - half_power * inverse + symbol(f"TERM_{precision}"),
+        )
+        if name == "GAMMA":  # where the noise depends on the state, its variance may be 0
+            ratio, divergence = select(noise, ratio, ONE), select(noise, divergence, ZERO)
+        factor, term, powers[name] = factor * ratio, term + divergence, half_power
+    value = program.assign(f"ENERGY{tag}", HALF * (sp.Float(LOG_2PI) + sp.log(factor) + e * step) + term)
+    value = program.assign(
+        f"ENERGY_VALID{tag}", where_valid(value, variance, iteration.r, xi_rate, powers["XI"], iteration.q)
+    )
+    return select(is_observed, value, ZERO) if is_observed != ONE else value

@@ -19,11 +19,13 @@ from estimator.models.model import Model
 _INLINE_TEMPLATES = {
     "present": "(1.0 if {0} == {0} else 0.0)",
     "finite": "(1.0 if {0} - {0} == 0.0 else 0.0)",
+    "zero_if_finite": "({0} - {0})",
     "below": "(0.0 if {0} >= 0.0 else 1.0)",
     "positive": "(1.0 if {0} > 0.0 else 0.0)",
     "rectified": "(0.0 if {0} < 0.0 else {0})",
     "reaches": "(1.0 if {0} >= {1} else 0.0)",
     "select": "({1} if {0} > 0.0 else {2})",
+    "where_valid": "({0} if {1} > 0.0 and {2} > 0.0 and {3} > 0.0 and {4} >= 0.0 and {5} >= 0.0 else NAN)",
     "clip": "({1} if not {0} > {1} else ({0} if {0} < {2} else {2}))",
 }
 

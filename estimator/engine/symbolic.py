@@ -40,6 +40,12 @@ is_negative = sp.Function("below")
 positive_part = sp.Function("rectified")
 #: ``clip(x, low, high)``: x within these limits.
 clip = sp.Function("clip")
+#: ``where_valid(x, a, b, c, d, e)``: x where a, b and c are positive and d and e are not negative, else NaN.
+where_valid = sp.Function("where_valid")
+#: ``zero_if_finite(x)``: 0, or NaN where x is not finite.
+zero_if_finite = sp.Function("zero_if_finite")
+#: ``log1p(x)``: log(1 + x), exact where x is small.
+log1p = sp.Function("log1p")
 
 
 class Program(Assignments):

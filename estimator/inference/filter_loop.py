@@ -20,6 +20,7 @@ from estimator.engine.source_cache import variant_digest
 from estimator.engine.storage_layout import belief_rows
 from estimator.engine.variational_free_energy import compile_free_energies
 from estimator.inference import mean_field
+from estimator.inference.member_steps import compile_member_steps
 from estimator.inference.noise_mixture import apply_switching, forecast_mixture, mark_diverged, reweight
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
@@ -56,7 +57,12 @@ class FilterLoop:
 def compile_structured_loop(
     model: Model, degree: int, iterations: int, expectations: str = "first_order", members: int = 1
 ) -> FilterLoop:
-    """Compile the loop of the structured factorisation; several members take a lane each."""
+    """Compile the loop of the structured factorisation; several members take a lane each.
+
+    Members share one linearisation, except with sigma points, which depend on a member's own covariance.
+    """
+    if members > 1 and expectations == "first_order":
+        return _compile_shared_loop(model, degree, iterations)
     lanes = 1 if members == 1 else LANES
     belief_update = kernels.compile_belief_update(
         model,
@@ -73,7 +79,7 @@ def compile_structured_loop(
     unsound = layout.get("INDEFINITE_COUNT", -1) * lanes
 
     @jit_closure(variant)
-    def update_block(W, before):
+    def update_block(W, C, before):
         if unsound >= 0:
             for j in range(lanes):
                 W[unsound + j] = 0.0
@@ -102,6 +108,16 @@ def compile_structured_loop(
     )
 
 
+def _compile_shared_loop(model: Model, degree: int, iterations: int) -> FilterLoop:
+    """Compile the loop of members about one linearisation."""
+    steps = compile_member_steps(model, degree, iterations)
+    run = _compile_loop(
+        steps.variant, model, steps.layout, LANES, 1, steps.update_block, steps.score_member,
+        steps.shared_layout, steps.share_linearisation,
+    )  # fmt: skip
+    return FilterLoop(run, steps.layout, LANES)
+
+
 @cache
 def compile_mean_field_loop(iterations: int, as_published: bool) -> FilterLoop:
     """Compile the loop of the paper's mean field, which gives no forecasts."""
@@ -111,7 +127,7 @@ def compile_mean_field_loop(iterations: int, as_published: bool) -> FilterLoop:
     variant = f"mean_field_{variant_digest(model.digest, iterations, as_published)}"
 
     @jit_closure(variant)
-    def update_block(W, before):
+    def update_block(W, C, before):
         begin(W)
         for i in range(iterations):
             iterate(W, as_published)
@@ -135,6 +151,8 @@ def _compile_loop(
     scratch: int,
     update_block: Any,
     score_member: Any,
+    shared_layout: Mapping[str, int] | None = None,
+    share_linearisation: Any = None,
 ) -> Any:
     """Compile `FilterLoop.run` around an update.
 
@@ -144,11 +162,16 @@ def _compile_loop(
         layout: row number of each quantity.
         lanes: lanes of a block.
         scratch: size of ``before``.
-        update_block: ``update_block(W, before)``: updates a block, and writes its free energies into ``before``.
+        update_block: ``update_block(W, C, before)``: updates a block, and writes its free energies into ``before``.
         score_member: ``score_member(W, j, before, values, forecasts)``: free energies and forecasts of lane j.
+        shared_layout: rows of the block C that the members share, with the input and the outputs; None without one.
+        share_linearisation: ``share_linearisation(W, weights, C)``: fills the rest of C.
     """
-    sensors, is_single = model.n_outputs, lanes == 1
-    load_sample = _compile_sample_loader(variant, model, layout, lanes)
+    sensors, is_single, is_shared = model.n_outputs, lanes == 1, shared_layout is not None
+    sample_layout = layout if shared_layout is None else shared_layout
+    shared_size = 1 if shared_layout is None else len(shared_layout) * lanes
+    load_sample = _compile_sample_loader(variant, model, sample_layout, lanes)
+    add_walk = _compile_walk(variant, model, layout, lanes)
     record_length = len(belief_rows(model)) * lanes
 
     @kernel(variant=variant)
@@ -156,7 +179,7 @@ def _compile_loop(
         stride, n_past, lookahead, repeats_first = steps[0], steps[1], steps[2], steps[3]
         members, samples, iterations = len(weights), len(outputs) - lookahead, energies.shape[1]
         judged = energies.shape[0] > 0
-        before = np.empty(scratch)
+        before, C = np.empty(scratch), np.zeros(shared_size)
         member_energies, shares = np.empty((members, iterations)), np.empty((members, iterations))
         predictions = np.empty((members, sensors, 2))
         old_weights, backup = np.empty(members), np.empty((len(W), record_length))
@@ -168,9 +191,14 @@ def _compile_loop(
                 inputs[i] = inputs[n_past]
         overflowed_at = -1
         for t in range(first, samples):
+            if is_shared:
+                load_sample(C, inputs, t * stride, stencil, outputs[t])
+                share_linearisation(W, weights, C)
             for b in range(len(W)):
-                load_sample(W[b], inputs, t * stride, stencil, outputs[t], walk)
-                update_block(W[b], before)
+                add_walk(W[b], walk)
+                if not is_shared:
+                    load_sample(W[b], inputs, t * stride, stencil, outputs[t])
+                update_block(W[b], C, before)
                 for j in range(min(lanes, members - b * lanes)):
                     m = b * lanes + j
                     score_member(W[b], j, before, member_energies[m], predictions[m])
@@ -206,15 +234,12 @@ def _compile_loop(
     return run
 
 
-def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
-    """Compile ``load_sample(W, inputs, start, stencil, output, walk)``: random walk, inputs and outputs of a sample."""
-    u_row = layout["U_0"] * lanes
-    y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
+def _compile_walk(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
+    """Compile ``add_walk(W, walk)``: the random walk of the coefficients over a sample."""
     variance_rows = tuple(layout[f"P_{c}_{c}"] * lanes for c in model.coefficients)
-    sensors = model.n_outputs
 
     @jit_closure(variant)
-    def load_sample(W, inputs, start, stencil, output, walk):
+    def add_walk(W, walk):
         walks = False
         for c in range(len(variance_rows)):
             walks = walks or walk[c] > 0.0
@@ -222,6 +247,18 @@ def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int]
             for c in range(len(variance_rows)):
                 for j in range(lanes):
                     W[variance_rows[c] + j] += walk[c]
+
+    return add_walk
+
+
+def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
+    """Compile ``load_sample(W, inputs, start, stencil, output)``: inputs and outputs of a sample."""
+    u_row = layout["U_0"] * lanes
+    y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
+    sensors = model.n_outputs
+
+    @jit_closure(variant)
+    def load_sample(W, inputs, start, stencil, output):
         for i in range(len(stencil)):
             value = 0.0
             for w in range(stencil.shape[1]):

@@ -108,15 +108,15 @@ class MixtureMoments(NamedTuple):
     """The moments of mixtures of beliefs, compiled.
 
     Attributes:
-        mix: ``mix(blocks, first, weights, shares, records, stride)`` writes the records of beliefs with the moments of
-            n mixtures (`estimator.engine.mixture_moments`); all NaN if no member is finite.
+        mix: ``mix(blocks, first, weights, n, records, stride)`` writes the records of beliefs with the moments of n
+            mixtures (`estimator.engine.mixture_moments`); all NaN where no member has a weight.
 
-            - ``blocks`` (blocks, rows * LANES): member m of system j is in lane m n + j, counted from block ``first``
-              on, with its record in the first rows; n divides `LANES`;
-            - ``weights`` (M, n) of the members;
-            - ``shares`` (M n,) receives the weights of the finite members, normalised for each system;
+            - ``blocks`` (blocks, rows * LANES): member m of system j stands in lane m n + j, counted from block
+              ``first`` on, with the numbers of its record in the first rows; n divides `LANES`;
+            - ``weights`` (M n,) of the members, which sum to 1 for a system;
             - ``records``: flat array that receives number i of system j at ``i * stride + j``.
-        mixture: ``mixture(blocks, weights)`` for one system with weights (M,): the shares (M,), and the record.
+        mixture: ``mixture(blocks, weights)``, of one system with weights (M,): the weights of the members whose numbers
+            are finite, which sum to 1, and the record.
     """
 
     mix: Any
@@ -126,56 +126,47 @@ class MixtureMoments(NamedTuple):
 @cache
 def compile_mixture(n_quantities: int) -> MixtureMoments:
     """Compile the moments of mixtures of beliefs in ``n_quantities`` states and coefficients, of one sensor."""
-    check, means, spreads, tails = compile_mixture_moments(n_quantities)
-    jit_variant = jit_closure(str(n_quantities))
-    size = n_quantities + n_quantities * (n_quantities + 1) // 2 + 2 * N_NOISES
+    moments, jit_variant = compile_mixture_moments(n_quantities), jit_closure(str(n_quantities))
+    add, finish = moments.add, moments.finish
+    first_shape = n_quantities + n_quantities * (n_quantities + 1) // 2
+    size = first_shape + 2 * N_NOISES
 
     @jit_variant
-    def share_out(blocks, first, weights, shares, likeliest):
-        """Normalise the weights of the finite members, and find the likeliest member (n,)."""
-        members, n = weights.shape
-        total, most = np.zeros(n), np.zeros(n)
-        for m in range(members):
-            at = m * n
-            check(blocks[first + at // LANES], at % LANES, shares, at, n)
-            for j in range(n):
-                share = weights[m, j] if shares[at + j] == 0.0 and weights[m, j] > 0.0 else 0.0
-                shares[at + j] = share
-                total[j] += share
-                likeliest[j] = m if share > most[j] else likeliest[j]
-                most[j] = max(most[j], share)
-        for m in range(members):
-            for j in range(n):
-                shares[m * n + j] /= total[j]
-
-    @jit_variant
-    def mix(blocks, first, weights, shares, records, stride):
-        members, n = weights.shape
-        X, begun, likeliest = np.zeros(size * LANES), np.empty(n_quantities * LANES), np.zeros(n, np.int64)
-        share_out(blocks, first, weights, shares, likeliest)
+    def refer_to_likeliest(blocks, first, weights, n, A):
+        """Put the mean of each system's likeliest member into A, and the inverse of its noises' variances."""
         for j in range(n):
-            at = likeliest[j] * n + j
+            likeliest = j
+            for at in range(j, len(weights), n):
+                likeliest = at if weights[at] > weights[likeliest] else likeliest
+            B, lane = blocks[first + likeliest // LANES], likeliest % LANES
             for i in range(n_quantities):
-                begun[i * LANES + j] = X[i * LANES + j] = blocks[first + at // LANES, i * LANES + at % LANES]
-        for at in range(0, members * n, n):
-            means(blocks[first + at // LANES], at % LANES, shares, at, begun, X, n)
-        for at in range(0, members * n, n):
-            spreads(blocks[first + at // LANES], at % LANES, shares, at, X, n)
-        for at in range(0, members * n, n):
-            tails(blocks[first + at // LANES], at % LANES, shares, at, X, n)
-        for k in range(size - 2 * N_NOISES, size, 2):
-            for j in range(n):
-                spread = X[k * LANES + j]
-                X[k * LANES + j] = 1.0 / spread
-                X[(k + 1) * LANES + j] /= spread
+                A[i * LANES + j] = B[i * LANES + lane]
+            for i in range(first_shape, size, 2):
+                A[(i + 1) * LANES + j] = B[i * LANES + lane] / B[(i + 1) * LANES + lane]
+
+    @jit_variant
+    def mix(blocks, first, weights, n, records, stride):
+        A, X = np.zeros(size * LANES), np.zeros(size * LANES)
+        refer_to_likeliest(blocks, first, weights, n, A)
+        for at in range(0, len(weights), n):
+            add(blocks[first + at // LANES], at % LANES, weights, at, A, X, n)
+        finish(A, X, n)
         for i in range(size):
             for j in range(n):
-                records[i * stride + j] = X[i * LANES + j] if shares[j] >= 0.0 else np.nan
+                records[i * stride + j] = X[i * LANES + j] if weights[j] >= 0.0 else np.nan
 
     @kernel(variant=str(n_quantities))
     def mixture(blocks, weights):
-        shares, record = np.empty(len(weights)), np.empty(size)
-        mix(blocks, 0, weights.reshape((-1, 1)), shares, record, 1)
-        return shares, record
+        kept, record = np.empty(len(weights)), np.empty(size)
+        total = 0.0
+        for m in range(len(weights)):
+            kept[m] = weights[m]
+            for i in range(size):
+                kept[m] = kept[m] if np.isfinite(blocks[m // LANES, i * LANES + m % LANES]) else 0.0
+            total += kept[m]
+        for m in range(len(weights)):
+            kept[m] /= total
+        mix(blocks, 0, kept, 1, record, 1)
+        return kept, record
 
     return MixtureMoments(mix, mixture)

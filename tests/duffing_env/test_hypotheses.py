@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from playing import assert_refused, random_actions, roll_out
+from reference.filters import carried
 from reference.mixture import hypotheses, mixed, weighed
 from reference.structured import structured_update
 from specimens import GUESSED
@@ -41,10 +42,11 @@ def weighing(twin):
 
         def _update(self):
             walk = (self.drift * np.sqrt(np.diag(self.first_belief.cov))) ** 2 * [0, 0, 1, 1, 1, 1]
-            updated = []
+            shared, updated = self._model_step(self.belief.mean), []
             for member in self.members:
                 widened = replace(member, cov=member.cov + np.diag(walk))
-                updated.append(structured_update(widened, self._model_step(member.mean), self.y, self.iterations))
+                step = carried(shared, member.mean - self.belief.mean)
+                updated.append(structured_update(widened, step, self.y, self.iterations))
             self.members, energies = zip(*updated, strict=True)
             self.weights, self.free_energy = weighed(self.weights, energies)
             self.belief = mixed(self.weights, self.members)

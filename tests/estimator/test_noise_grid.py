@@ -1,10 +1,14 @@
 """Noise hypotheses: the mixture against its definition, and recovery of the true ratio."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from estimators import AHEAD, record
+from reference.filters import carried, difference_step
+from reference.mixture import hypotheses, weighed
+from reference.mixture import mixed as mixture_of
+from reference.structured import structured_update
 from scipy.special import logsumexp
 from tables import table
 
@@ -189,8 +193,9 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
     found, size = compile_mixture(names), records.shape[2]
     before = np.full((LANES, size), np.nan)
     blocks = pack_into_lanes(np.concatenate([before, records.reshape(-1, size)]), LANES)
-    shares, mixed_records = np.empty(members * n), np.empty((size, LANES))
-    found.mix(blocks, 1, weights, shares, mixed_records.reshape(-1), LANES)
+    finite = np.isfinite(records).all(axis=2)
+    shares, mixed_records = weights * finite / (weights * finite).sum(axis=0), np.empty((size, LANES))
+    found.mix(blocks, 1, shares.reshape(-1), n, mixed_records.reshape(-1), LANES)
     for j in range(n):
         kept = np.isfinite(records[:, j]).all(axis=1) & (weights[:, j] > 0)
         own = weights[kept, j] / weights[kept, j].sum()
@@ -200,11 +205,10 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
         gammas = [moment_matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in (0, 2)]
         expected = np.concatenate([mean, cov[upper], *gammas])
         np.testing.assert_allclose(mixed_records[:, j], expected, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(shares.reshape(members, n)[kept, j], own, rtol=1e-14)
-        assert (shares.reshape(members, n)[~kept, j] == 0).all()
         of_one, record = found.mixture(pack_into_lanes(records[:, j], LANES), weights[:, j].copy())
-        np.testing.assert_array_equal(record, mixed_records[:, j])
-        np.testing.assert_array_equal(of_one, shares.reshape(members, n)[:, j])
+        np.testing.assert_allclose(record, mixed_records[:, j], rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(of_one[kept], own, rtol=1e-14)
+        assert (of_one[~kept] == 0).all()
 
 
 def test_a_mixture_of_no_finite_member_is_nothing():
@@ -215,9 +219,38 @@ def test_a_mixture_of_no_finite_member_is_nothing():
 # --- The estimator -------------------------------------------------------------------------------------------------
 
 
-@ANY_MODEL
-def test_it_is_the_mixture_of_its_members(samples, model):
+@dataclass(frozen=True)
+class Member:
+    """A belief of the references: shape and rate of γ, and of ξ."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+    gamma: tuple[float, float]
+    xi: tuple[float, float]
+
+
+def test_members_share_the_linearisation_about_their_mixture(samples):
     u, y = samples
+    estimator, prior = ensemble("paper"), silverbox_prior()
+    g, g_rate, n, n_rate = prior.noises
+    beliefs = hypotheses(Member(prior.mean, prior.cov, (g, g_rate), (n, n_rate)), RATIOS)
+    weights, expected = np.full(len(beliefs), 1 / len(beliefs)), []
+    for t in range(len(u)):
+        center = mixture_of(weights, beliefs).mean
+        step = difference_step(center, u[t - 1] if t else 0.0)
+        updates = [structured_update(one, carried(step, one.mean - center), y[t], 3) for one in beliefs]
+        beliefs, energies = zip(*updates, strict=True)
+        weights, energy = weighed(weights, energies)
+        expected.append(energy)
+    np.testing.assert_allclose(estimator.run(u, y)[:, -1], expected, rtol=1e-8, atol=1e-8)
+    last = mixture_of(weights, beliefs)
+    std = np.sqrt(np.diag(last.cov))
+    np.testing.assert_allclose((estimator.belief.mean - last.mean) / std, 0, atol=1e-7)
+    np.testing.assert_allclose((estimator.belief.cov - last.cov) / np.outer(std, std), 0, atol=1e-7)
+
+
+def test_members_with_sigma_points_are_estimators_of_their_own(samples):
+    u, y, model = *samples, "look-ahead"
     estimator, alone = ensemble(model), list(members(model))
     free_energies = estimator.run(u, y)
     energies = np.array([each.run(u, y) for each in alone])

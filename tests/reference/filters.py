@@ -181,6 +181,11 @@ def sample(plant: Plant, n: int, mean: np.ndarray, inputs: Sequence[float]) -> S
     return Step(moved(plant, mean[:n], mean[n:], inputs), S, spread(plant, mean[:n], mean[n:], inputs))
 
 
+def carried(step: Step, deviation: np.ndarray) -> Step:
+    """The same sample of a mean that deviates by (m,) from the one it was linearised about."""
+    return step._replace(moved=step.moved + step.jacobian[: len(step.moved)] @ deviation)
+
+
 def difference_step(mean: Sequence[float], u: float) -> Step:
     """Eq. (2), by hand: a sample from the mean (6,) of (x_t, x_{t-1}, θ1, θ2, θ3, η)."""
     x, last_x, t1, t2, t3, e = mean
