@@ -5,6 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine.printer_numba import print_expression
+from estimator.engine.psd_projection import project_to_psd
 from estimator.engine.storage_layout import likelihood_total_rows
 from estimator.engine.symbolic import (
     HALF,
@@ -14,6 +15,7 @@ from estimator.engine.symbolic import (
     Propagation,
     differentiate,
     input_at_end,
+    positive_part,
     symbol,
     symmetric_entry,
 )
@@ -45,21 +47,7 @@ def linearised_filter_step(
     n, lines = len(states), Program()
     assign = lines.assign
     mean = dict(zip(states, propagation.state, strict=True))
-    cov: dict[tuple[str, str], sp.Expr] = {}
-    for a, i in enumerate(states):
-        row = {
-            k: assign(
-                f"FP_{i}_{k}",
-                sum((propagation.jacobian[a][m] * symmetric_entry("P", states[m], k, states) for m in range(n)), ZERO),
-            )
-            for k in states
-        }
-        for b in range(a, n):
-            total = sum(
-                (propagation.jacobian[b][m] * row[states[m]] for m in range(n)),
-                symbol("PROCESS_VARIANCE") * propagation.noise_cov[a][b],
-            )
-            cov[i, states[b]] = assign(f"P_PRED_{i}_{states[b]}", total)
+    cov = _predicted_covariance(lines, model, propagation, follows_outputs)
     state_sensitivity = {
         (i, c): assign(
             f"DX_PRED_{i}_{c}",
@@ -82,6 +70,8 @@ def linearised_filter_step(
         h = [slope.xreplace(at_mean) for slope in found.output_slopes[k]]
         cross_cov = {i: assign(f"PH{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}
         state_part_variance = assign(f"HPH{tag}", sum((h[m] * cross_cov[states[m]] for m in range(n)), ZERO))
+        if follows_outputs:  # rounding may leave a negative variance of a covariance that diverged
+            state_part_variance = assign(f"HPH_POSITIVE{tag}", positive_part(state_part_variance))
         innovation_variance = assign(f"S{tag}", state_part_variance + symbol(f"R_{sensor}"))
         inverse_innovation_variance = assign(f"S_INVERSE{tag}", 1 / innovation_variance)
         output_sensitivity = {
@@ -122,3 +112,28 @@ def linearised_filter_step(
         if total != symbol(name):
             results[name] = print_expression(assign(f"{name}_e", total))
     return lines, results
+
+
+def _predicted_covariance(
+    lines: Program, model: Model, propagation: Propagation, follows_outputs: bool
+) -> dict[tuple[str, str], sp.Expr]:
+    """The upper triangle of F P Fᵀ + q N, by the states' names.
+
+    Integration steps that are too long make N indefinite, and S smaller than R: a hole in the likelihood. So N is
+    projected where outputs are followed.
+    """
+    states = list(model.states)
+    n, jacobian, noise_cov = len(states), propagation.jacobian, propagation.noise_cov
+    if follows_outputs and not propagation.is_psd:
+        noise_cov = project_to_psd(lines, noise_cov)
+    cov: dict[tuple[str, str], sp.Expr] = {}
+    for a, i in enumerate(states):
+        row = {}
+        for k in states:
+            total = sum((jacobian[a][m] * symmetric_entry("P", states[m], k, states) for m in range(n)), ZERO)
+            row[k] = lines.assign(f"FP_{i}_{k}", total)
+        for b in range(a, n):
+            noise = symbol("PROCESS_VARIANCE") * noise_cov[a][b]
+            total = sum((jacobian[b][m] * row[states[m]] for m in range(n)), noise)
+            cov[i, states[b]] = lines.assign(f"P_PRED_{i}_{states[b]}", total)
+    return cov
