@@ -40,7 +40,7 @@ compat: $(READY)  ## what other RL libraries make of the environments, in .venv-
 	.venv-compat/bin/python -m pip install --quiet --no-deps --editable .
 	.venv-compat/bin/python -m pip install --quiet --no-deps --upgrade --target .venv-compat/newest gymnasium==1.4.0
 	.venv-compat/bin/python -m benchmarks.compat
-	.venv-compat/bin/python -m pytest tests/test_examples.py tests/agents/test_train_seeds.py
+	.venv-compat/bin/python -m pytest tests/test_examples.py tests/agents/test_multi_seed_training.py
 	.venv-compat/bin/python -m benchmarks.ray_node_kill
 	PYTHONPATH=.venv-compat/newest .venv-compat/bin/python -m benchmarks.compat
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.storage.kernel_spec import block_layout, noise_std_rows
 from duffing_env.storage.random_streams import new_stream_words

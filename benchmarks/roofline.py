@@ -21,7 +21,7 @@ from benchmarks.timed_rounds import Result, Row, measure, timed
 from duffing_env.batch import Batch
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.kernel import RESET_NEXT_STEP
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.kernel_stages.sample_stages import compile_update
 from duffing_env.storage.kernel_spec import block_layout

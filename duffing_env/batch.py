@@ -79,7 +79,7 @@ class Batch:
         self._truth_rows = {name: f"PARAM_{name}" for name in parameter_names(model)} | (
             noise_std_rows(model) if draws_noises else {}
         )
-        self._truth_scales = np.array([parameter_scale(experiment, name) for name in self._truth_rows])
+        self._truth_scales = np.array([physical_unit_factor(experiment, name) for name in self._truth_rows])
         n_rows, n_observation = max(self._row_of.values()) + 1, len(observation_bounds(experiment.model))
         # A copy: Numba types a read-only array differently, and would compile the step anew.
         self._replayed_record = np.stack(experiment.replayed_record)
@@ -315,7 +315,7 @@ class Batch:
         self.outcomes = self._outcomes[:, : self.size]
 
 
-def parameter_scale(experiment: Experiment, name: str) -> float:
+def physical_unit_factor(experiment: Experiment, name: str) -> float:
     """Factor from the internal to the physical unit of a true parameter, or of a noise in the first sensor."""
     scales, model = experiment.scales, experiment.truth_model
     if name in model.dimensions:

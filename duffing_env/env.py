@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from duffing_env.batch import Batch
-from duffing_env.custom_functions import CustomFunctions
+from duffing_env.custom_observation_and_reward import CustomFunctions
 from duffing_env.env_common import (
     ExperimentEnv,
     action_space,
@@ -89,7 +89,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     | ``simulation_error`` | s_{t-1} - s_t, s the relative error of a free run, at most 1 | [-1, 1] |
     | ``free_energy`` | -F_t, the sample's free energy: a foil that rewards predictable outputs | unbounded |
 
-    The ranges are for an episode's sum. `duffing_env.rewards.reward_registry` (the manual's page "Rewards") gives the
+    The ranges are for an episode's sum. `duffing_env.rewards.named_rewards` (the manual's page "Rewards") gives the
     bounds and the weaknesses of each. A terminated episode keeps its gain unless ``terminated_return`` is set;
     ``terminal`` pays the whole sum in the last step.
 
@@ -133,7 +133,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     |----------|---------|---------|
     | ``factorisation`` | ``structured`` | the estimator's: ``structured`` or ``mean_field`` |
     | ``iterations`` | 3 or 10 | variational iterations per sample (structured, mean field) |
-    | ``reward`` | ``information_gain`` | see above; or a function (`duffing_env.custom_functions`) |
+    | ``reward`` | ``information_gain`` | see above; or a function (`duffing_env.custom_observation_and_reward`) |
     | ``observation`` | ``posterior`` | or ``history``, ``privileged``, or a function |
     | ``history`` | 16 | steps that the observation ``history`` shows |
     | ``max_input`` | 0.15 | input limit [V] |

@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
 from duffing_env.batch import Batch
-from duffing_env.custom_functions import CustomFunctions, experiment_observation_bounds
+from duffing_env.custom_observation_and_reward import CustomFunctions, experiment_observation_bounds
 from duffing_env.experiment_config import Experiment
 from estimator.support.argument_checks import did_you_mean, short_repr, to_float_array
 from estimator.support.array_types import FloatArray

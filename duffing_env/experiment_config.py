@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from duffing_env.belief_arrays import Beliefs, check_observation
-from duffing_env.rewards.reward_registry import check_reward, kernel_reward
+from duffing_env.rewards.named_rewards import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
 from estimator.belief import Belief

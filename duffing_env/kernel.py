@@ -13,9 +13,9 @@ from typing import Any
 from numba import prange
 
 from duffing_env.kernel_stages import plant_stages, sample_stages
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.noise_filter_bank import NO_FILTER_BANK, compile_filter_bank
-from duffing_env.rewards.reward_registry import compile_reward_hooks
+from duffing_env.rewards.named_rewards import compile_reward_hooks
 from duffing_env.storage.kernel_spec import (
     OUTCOME_ROWS,
     KernelSpec,

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from duffing_env.batch import Batch, spawn_seeds
-from duffing_env.custom_functions import CustomFunctions
+from duffing_env.custom_observation_and_reward import CustomFunctions
 from duffing_env.env import DuffingEnv
 from duffing_env.env_common import (
     ExperimentEnv,

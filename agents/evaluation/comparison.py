@@ -111,8 +111,8 @@ def _write_figures(folder: Path, evaluations: list[Evaluation], title: str) -> t
     """Write the figures, where matplotlib is installed; returns the names of their files."""
     if is_not_installed("matplotlib"):
         return ()
-    from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
+    from agents.evaluation.figures import plot_inputs_and_outputs, plot_log_posterior_gain, save_png
 
-    save_png(plot_posterior_contraction(evaluations, title), folder / "contraction.png")
+    save_png(plot_log_posterior_gain(evaluations, title), folder / "contraction.png")
     save_png(plot_inputs_and_outputs(evaluations), folder / "excitations.png")
     return "contraction.png", "excitations.png"

@@ -85,7 +85,7 @@ def plot_learning_curve(
     return figure
 
 
-def plot_posterior_contraction(evaluations: list[Evaluation], title: str = "") -> Figure:
+def plot_log_posterior_gain(evaluations: list[Evaluation], title: str = "") -> Figure:
     """Gain of the log posterior at the truth over the samples: median over systems, band from 25 to 75 %."""
     figure = new_figure(7.5, 4.5 + 0.22 * math.ceil(len(evaluations) / 3))
     axes = figure.add_subplot()

@@ -18,7 +18,7 @@ from agents.evaluation.figures import (
     plot_calibration,
     plot_error_against_information,
     plot_inputs_and_outputs,
-    plot_posterior_contraction,
+    plot_log_posterior_gain,
 )
 from agents.evaluation.policy_rollout import Evaluation
 from agents.result_files import package_versions
@@ -41,7 +41,7 @@ def write_html_report(
     figures = [
         (
             "Posterior contraction",
-            plot_posterior_contraction(evaluations),
+            plot_log_posterior_gain(evaluations),
             "Gain of the posterior's log density at the truth: median over systems, band from 25 to 75 %.",
         ),
         (

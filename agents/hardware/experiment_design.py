@@ -10,7 +10,7 @@ from typing import NamedTuple
 from scipy.special import ndtri
 
 from estimator.belief import Belief
-from estimator.identification.data.column_names import name_with_unit, unit_in_name
+from estimator.identification.data.column_units import name_with_unit, unit_in_name
 from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
 from estimator.support.file_io import write_atomically

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 from agents.output_paths import check_output_folder
 from agents.result_files import package_versions, replace_non_finite
-from estimator.identification.data.column_names import name_with_unit
+from estimator.identification.data.column_units import name_with_unit
 from estimator.rigs.rig import Rig
 from estimator.support.file_io import append_atomically, explain_write_errors, lock_folder, write_atomically
 

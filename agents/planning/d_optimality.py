@@ -24,7 +24,7 @@ import numpy as np
 
 from estimator.compilation.array_operations import copy_scaled, fill
 from estimator.compilation.simd import jit, jit_closure, kernel
-from estimator.engine.adjoint import compile_adjoint
+from estimator.engine.information_gradient import compile_adjoint
 from estimator.engine.input_hold import n_older_inputs
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
@@ -77,7 +77,7 @@ class DOptimality(NamedTuple):
             the peak of |x|. A trajectory that diverges (`DIVERGED_RATIO`) counts up to that sample.
         criterion_and_gradient: the same, and fills in ``workspace.gradient``.
         input_at: ``input_at(start, u, t)`` returns the input at sample t, which may lie before the first.
-        path_functions: of `estimator.engine.adjoint.compile_adjoint`.
+        path_functions: of `estimator.engine.information_gradient.compile_adjoint`.
     """
 
     start_size: int

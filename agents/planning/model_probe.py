@@ -38,7 +38,7 @@ class ModelView(NamedTuple):
         """The view of an experiment of duffing_env.
 
         On a plant whose input goes linearly from one action to the next, a difference equation takes the input at the
-        start of a sample, as the environment feeds it (`duffing_env.kernel_stages.generated_model_functions`).
+        start of a sample, as the environment feeds it (`duffing_env.kernel_stages.generated_environment_functions`).
         """
         model = experiment.model
         if model.is_continuous:

@@ -41,17 +41,17 @@ def hold_samples_for(samples_left, n_moves, max_hold):
 
 
 @jit
-def shift_plan(plan, n_moves, previous_hold, hold):
+def drop_played_move(plan, n_moves, previous_hold, hold):
     """Drop the first move of a plan, which was played, and divide the others where moves are shorter than before.
 
     A plan that is not divided ends with the mirrored first move.
 
     Example:
         >>> plan = np.array([1.0, 0.5, -1.0, 0.0])
-        >>> shift_plan(plan, 4, 6, 3)
+        >>> drop_played_move(plan, 4, 6, 3)
         >>> plan
         array([ 0.5,  0.5, -1. , -1. ])
-        >>> shift_plan(plan, 4, 3, 3)
+        >>> drop_played_move(plan, 4, 3, 3)
         >>> plan
         array([ 0.5, -1. , -1. , -0.5])
     """

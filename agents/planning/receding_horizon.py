@@ -27,7 +27,7 @@ from agents.planning.discount import fill_discount_weights, filter_delay_in_move
 from agents.planning.grid_beam_search import SearchProblem, compile_grid_beam_search
 from agents.planning.model_probe import ModelView
 from agents.planning.newton_steps import empty_candidate_batch
-from agents.planning.plan_mutations import hold_samples_for, shift_plan
+from agents.planning.plan_mutations import drop_played_move, hold_samples_for
 from agents.planning.plan_objective import PlanObjective, objective_at
 from agents.planning.plan_refinement import compile_plan_refinement
 from estimator.compilation.array_operations import copy, fill, index_of_max
@@ -217,8 +217,8 @@ def _compile_decision(model: Model, degree: int, lag: int) -> Any:
         W = memory.beams[0]
         problem = search_problem(record, samples_left, objective, previous_inputs, information_rate, batch.weights)
         n_moves, hold = problem.n_moves, problem.hold_samples
-        shift_plan(best, n_moves, previous_hold, hold)
-        shift_plan(runner_up, n_moves, previous_hold, hold)
+        drop_played_move(best, n_moves, previous_hold, hold)
+        drop_played_move(runner_up, n_moves, previous_hold, hold)
         n = _N_PLANS_KEPT + (_N_FINAL_SEARCHES if samples_left <= _FINAL_HORIZON * hold else 1)
         starts, scores, end_precisions = np.zeros((n, len(best))), np.empty(n), np.zeros((n, k, k))
         copy(starts[0], 0, best, len(best))

@@ -10,7 +10,7 @@ from agents.training.algorithms import (
     TQCSettings,
 )
 from agents.training.hyperparameter_search import tune_hyperparameters
-from agents.training.train_seeds import train_seeds
+from agents.training.multi_seed_training import train_seeds
 from agents.training.training_config import TrainConfig, TrainingSubject
 from agents.training.training_loop import TrainingRun
 from agents.training.training_run import resume, train

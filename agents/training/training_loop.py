@@ -106,8 +106,8 @@ class TrainingLoop:
         elif config.begin is not None:
             load_initial_network(config.begin, self._model)
         elif config.imitate is not None:
+            from agents.training.dagger_pretraining import imitate_policy
             from agents.training.environments.feature_vec_env import FeatureVecEnv
-            from agents.training.imitation import imitate_policy
 
             assert isinstance(self._envs, FeatureVecEnv)
             with show_progress("Imitating") as on_progress:

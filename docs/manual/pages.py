@@ -21,12 +21,12 @@ from agents import POLICIES
 from agents.leaderboard import leaderboard_file, leaderboard_tables
 from agents.policies import TRAINED, trained_policies
 from duffing_env import TRACKS
-from duffing_env.rewards import reward_registry
+from duffing_env.rewards import named_rewards
 
 #: A file of the repository that pages link to, to the page that is made of it.
 MADE_OF = {
     "duffing_env/tracks/track_registry.py": "tracks/index.md",
-    "duffing_env/rewards/reward_registry.py": "rewards.md",
+    "duffing_env/rewards/named_rewards.py": "rewards.md",
     "agents/policies/__init__.py": "reference/policies.md",
     "agents/leaderboard.jsonl": "leaderboard.md",
 }
@@ -47,7 +47,7 @@ REFERENCE = {
         "agents.training.TrainConfig",
         "agents.training.train",
         "agents.training.resume",
-        "agents.training.train_seeds",
+        "agents.training.multi_seed_training",
         "agents.training.tune_hyperparameters",
         "agents.training.PPOSettings",
         "agents.training.SACSettings",
@@ -74,7 +74,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {
         "tracks/index.md": _tracks(),
         **{_page(track): _track(track) for track in TRACKS},
-        "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(reward_registry) or '')}",
+        "rewards.md": f"# Rewards\n\n{_fenced(inspect.getdoc(named_rewards) or '')}",
         "reference/policies.md": _policies(),
         "leaderboard.md": _leaderboard(),
         **{f"reference/{name}.md": _reference(name, objects) for name, objects in REFERENCE.items()},

@@ -44,7 +44,7 @@ def expected_sample_source(
     Args:
         name: name of the function.
         spec: kind of experiment with the believed model.
-        loop: loop printer of `duffing_env.kernel_stages.generated_model_functions`.
+        loop: loop printer of `duffing_env.kernel_stages.generated_environment_functions`.
         substitutions: quantity of the model to the row or expression in its place.
         first_assignments: assignments that come first.
         keeps_covariance: whether the covariance afterwards is kept, in the rows of ``substitutions``.

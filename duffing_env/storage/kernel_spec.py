@@ -40,7 +40,7 @@ class KernelSpec(NamedTuple):
         factorisation: ``structured``, or the paper's ``mean_field``.
         iterations: variational iterations per sample that the structured update is generated with; 0 for mean field,
             which takes them from `KernelParams`.
-        reward_hooks: name of a reward with hooks (`duffing_env.rewards.reward_registry`); empty for the other rewards,
+        reward_hooks: name of a reward with hooks (`duffing_env.rewards.named_rewards`); empty for the other rewards,
             whose weights are in `KernelParams`.
         has_noise_hypotheses: whether an environment weighs several beliefs
             (`duffing_env.kernel_stages.noise_filter_bank`); their number is in `KernelParams`.
@@ -82,7 +82,7 @@ class KernelParams(NamedTuple):
             the standard deviation of a log-normal parameter's logarithm, and 0 stands for a log-uniform parameter.
         measurement_noise: (sensors,) standard deviations.
         walk_variances: (K,) variances of the coefficients' random walk in a sample.
-        reward_weights: (4,) weights of the reward's terms (`duffing_env.rewards.reward_registry.Reward`).
+        reward_weights: (4,) weights of the reward's terms (`duffing_env.rewards.named_rewards.Reward`).
         terminal: whether the whole reward is paid at the end of the episode.
         has_terminated_return: whether a terminated episode returns ``terminated_return``.
         terminated_return: return of a terminated episode.

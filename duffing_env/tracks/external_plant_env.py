@@ -16,7 +16,7 @@ from gymnasium.error import ResetNeeded
 
 from duffing_env.env import DuffingEnv, Observation
 from duffing_env.experiment_config import MAX_SAMPLES, Experiment, check_prior
-from duffing_env.rewards.reward_registry import kernel_reward
+from duffing_env.rewards.named_rewards import kernel_reward
 from estimator.belief import Belief
 from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.model import Model

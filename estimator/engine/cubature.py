@@ -6,13 +6,13 @@ The factor L of the covariance, L Lᵀ = P, begins with the *movers*, the quanti
 points lie along its columns times √n, n the number of active columns. A mover that has variance 0, or depends linearly
 on movers before it, leaves a column of zeros without weight. All lanes run through all columns. Rows:
 
-============  ======================================================================================
-``L_c_i``     entry i of column c of √n L
-``WEIGHT_c``  weight of each of the two points along column c
-``X_i``       coefficient i at the current point; its state is in ``M_i``
-``I_p_i``     state i after the sample at point p: 2 c along column c, 2 c + 1 against it
-``UNSOUND``   count of covariances that were not positive semi-definite, since the row was last set to 0
-============  ======================================================================================
+====================  ==============================================================================
+``L_c_i``             entry i of column c of √n L
+``WEIGHT_c``          weight of each of the two points along column c
+``POINT_i``           coefficient i at the current point; its state is in ``M_i``
+``IMAGE_p_i``         state i after the sample at point p: 2 c along column c, 2 c + 1 against it
+``INDEFINITE_COUNT``  count of indefinite covariances since the row was last set to 0
+====================  ==============================================================================
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def propagate_point(model: Model, degree: int) -> Assignments:
 
 
 def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str]]:
-    """A sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``I_P``."""
+    """A sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``IMAGE_P``."""
     lines, _ = place_point(model)
     named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
@@ -113,7 +113,7 @@ def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str
 
 
 def point_moments(model: Model) -> tuple[Assignments, Propagation]:
-    """Mean and covariance Q of the points after the sample; the process noise covariance is evaluated at the mean."""
+    """Mean and covariance P⁻ of the points after the sample; the process noise covariance is evaluated at the mean."""
     states, m = list(model.states), len(model.dynamic_names)
     lines: Assignments = []
     weight = [symbol(f"WEIGHT_{c}") for c in range(m)]

@@ -34,13 +34,13 @@ class ExpectedUpdate:
         advance: ``advance(W, record, walk)``: one sample without data in every lane. ``record`` is the flat record of a
             belief, for the means of the coefficients and precisions; ``walk`` (K,) are the variances of the
             coefficients' random walk before the sample. It writes the predicted output of the first sensor into
-            ``SHOWN``, its variance into ``SPREAD``, and into ``SURPRISE`` the variance by which
+            ``Y_PRED``, its variance into ``S_PRED``, and into ``PENDING_VARIANCE`` the variance by which
             the output before, if it was predicted too, will shift the prediction.
         final_information: ``final_information(W, M, s)``: writes ½ log det(C⁻¹ + s² M Mᵀ) [nats] into
-            ``KNOWN``, with C the coefficients' covariance and M (K, K), lower triangular, the factor of the
+            ``INFORMATION``, with C the coefficients' covariance and M (K, K), lower triangular, the factor of the
             information beyond the plan; `DIVERGED_SCORE` where C is no covariance.
         layout: row number of each quantity. The first rows are the memory of a plan between two samples: the states,
-            the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``BEGUN``,
+            the joint covariance ``P_i_j`` of states and coefficients, the inputs, ``COST``, and ``HAS_PENDING``,
             which is 0 before the first sample. A differential equation adds its states in the middle and at the end of
             the last sample (``MIDDLE_i``, ``END_i``). ``COST``, ``SCORE``, ``MARGIN``, ``NEAR`` and ``CELL`` are the
             caller's.
@@ -97,7 +97,7 @@ def input_history_rows(model: Model, degree: int, lag: int) -> list[str]:
     return ["INPUT", "LAST_INPUT", "OLDER_INPUT"][: older + 1]
 
 
-def input_polynomial(model: Model, degree: int, lag: int) -> dict[str, Any]:
+def input_coefficients_from_history(model: Model, degree: int, lag: int) -> dict[str, Any]:
     """``U_k`` of the input over a sample, in symbols of `input_history_rows`."""
     from estimator.engine.symbolic import symbol
 
@@ -111,7 +111,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapp
     from estimator.engine import gaussian_update, printer_numba, symbolic, variational_rk4
 
     symbol, coefficients = symbolic.symbol, list(model.coefficients)
-    input_values = input_polynomial(model, degree, lag)
+    input_values = input_coefficients_from_history(model, degree, lag)
     lines, propagation = (
         variational_rk4.coarse_propagation(model, degree)
         if model.is_continuous

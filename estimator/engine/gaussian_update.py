@@ -1,14 +1,14 @@
 """Kalman update of the joint belief in states and coefficients with unknown noise variances, as assignments.
 
-With M, S, N of a sample (`estimator.engine.symbolic`) the predicted covariance of states and coefficients is
-Q = S P Sᵀ. The sensors are taken one after another. With h the gradient of a sensor's output,
+With M, F, Q of a sample (`estimator.engine.symbolic`) the predicted covariance of states and coefficients is
+P⁻ = F P Fᵀ. The sensors are taken one after another. With h the gradient of a sensor's output,
 
-    c = Q h,   s = hᵀ Q h,   e = y - prediction,   q = hᵀ N h / E[γ],   r = 1/E[ξ],
+    S = hᵀ P⁻ h + q + r,   ν = y - prediction,   q = hᵀ Q h / E[γ],   r = 1/E[ξ],
 
-the step for fixed E[γ] and E[ξ] is a Kalman step. The free energy is minimised over q(γ) and q(ξ) by the second moments
-of both noises under the posterior of that step, which are scalar functions:
+the step for fixed E[γ] and E[ξ] is a Kalman step with the gain K = (P⁻ + Q/E[γ]) h / S. The free energy is minimised
+over q(γ) and q(ξ) by the second moments of both noises under the posterior of that step, which are scalar functions:
 
-    E[w²] = (q e/S)² + q (1 - q/S),   E[v²] = (r e/S)² + r (1 - r/S),   S = s + q + r.
+    E[w²] = (q ν/S)² + q (1 - q/S),   E[v²] = (r ν/S)² + r (1 - r/S).
 
 γ is updated by the first sensor whose output depends on the process noise of the same sample; without one, γ stays.
 
@@ -67,7 +67,7 @@ class GaussianUpdate:
             **{c: symbol(c) for c in model.coefficients},
         }
         self.cov: dict[tuple[str, str], sp.Expr] = {}
-        self.transition_cov: dict[str, dict[str, sp.Expr]] = {}  # rows of S P, by state
+        self.transition_cov: dict[str, dict[str, sp.Expr]] = {}  # rows of F P, by state
         self._predict()
 
     def __getitem__(self, key: tuple[str, str]) -> sp.Expr:
@@ -75,7 +75,7 @@ class GaussianUpdate:
         return self.cov[(i, j) if self.names.index(i) <= self.names.index(j) else (j, i)]
 
     def _predict(self) -> None:
-        """Q = S P Sᵀ in the states' rows, or the given ``Q_i_j`` if there is no S; the coefficients' block stays."""
+        """F P Fᵀ in the states' rows, or the given ``P_PRED_i_j`` if there is no F; the coefficients' block stays."""
         names, jacobian, rows = self.names, self.propagation.jacobian, self.transition_cov
         for a, i in enumerate(names):
             for j in names[a:]:
@@ -110,7 +110,7 @@ class GaussianUpdate:
     def pending_output_variance(self, output_slope: Sequence[sp.Expr], sensor_variance: sp.Expr) -> sp.Expr:
         """Variance by which the output of the sample before, not measured yet, will shift a sensor's prediction.
 
-        With P after that output it is (hᵀ S P h)² / (r - hᵀ P h): the gain is P h / r, and the innovation's variance
+        With P after that output it is (hᵀ F P h)² / (r - hᵀ P h): the gain is P h / r, and the innovation's variance
         r² / (r - hᵀ P h). The divisor is kept above 0, since the P of a prior may exceed the P after an output.
         """
         h = {i: slope for i, slope in zip(self.names, output_slope, strict=True) if slope != 0}
@@ -131,7 +131,7 @@ class GaussianUpdate:
         )
 
     def output_process_noise(self, output_slope: Sequence[sp.Expr]) -> sp.Expr:
-        """hᵀ N h: variance of a sensor's output by process noise of unit strength."""
+        """hᵀ Q h: variance of a sensor's output by process noise of unit strength."""
         n = len(self.states)
         total = sum(
             (output_slope[a] * output_slope[b] * self.propagation.noise_cov[a][b] for a in range(n) for b in range(n)),
@@ -140,7 +140,7 @@ class GaussianUpdate:
         return sp.expand(total) if not total.free_symbols else total
 
     def innovation_covariance(self, output_slope: Sequence[sp.Expr], tag: str) -> tuple[dict[str, sp.Expr], sp.Expr]:
-        """Covariances c = Q h with a sensor's output, and its variance s = hᵀ c."""
+        """Covariances P⁻ h with a sensor's output, and its variance hᵀ P⁻ h."""
         cross_cov = {}
         for i in self.names:
             total = sum((h * self[i, j] for j, h in zip(self.names, output_slope, strict=True)), ZERO)
@@ -149,7 +149,7 @@ class GaussianUpdate:
         return cross_cov, self.assign(f"HPH{tag}", s)
 
     def add_process_noise(self, process_variance: sp.Expr) -> None:
-        """Add the process noise: Q + N ``process_variance`` in the states' block."""
+        """Add the process noise: P⁻ + Q ``process_variance`` in the states' block."""
         for a, i in enumerate(self.states):
             for b in range(a, len(self.states)):
                 k, unit_noise = self.states[b], self.propagation.noise_cov[a][b]
@@ -166,13 +166,13 @@ class GaussianUpdate:
         tag: str,
         is_observed: sp.Expr = ONE,
     ) -> None:
-        """Condition on a sensor: mean + c e/S and Q - c cᵀ/S.
+        """Condition on a sensor, with c = P⁻ h: mean + c ν/S and P⁻ - c cᵀ/S.
 
         Args:
             output_slope: h.
             cross_cov: c, by quantity.
             inverse_innovation_cov: 1/S.
-            scaled_innovation: e/S.
+            scaled_innovation: ν/S.
             retained_fraction: r/S. A quantity that the sensor measures directly keeps this fraction of its row, which
                 rounding cannot make negative.
             tag: the sensor's number, in the names of the assignments.
@@ -289,9 +289,9 @@ def belief_update(
 def update_without_data(model: Model, propagation: Propagation, degree: int) -> tuple[Assignments, dict[str, str]]:
     """`belief_update` with every output equal to its prediction, and given noise variances.
 
-    The noise variances are in ``Q`` and ``R_<sensor>``. The results are the predicted output of the
-    first sensor in ``SHOWN``, its variance in ``SPREAD``, and `GaussianUpdate.pending_output_variance`
-    in ``SURPRISE``, which is 0 for the first sample: ``BEGUN`` is 1 after it.
+    The noise variances are in ``PROCESS_VARIANCE`` and ``R_<sensor>``. The results are the predicted output of the
+    first sensor in ``Y_PRED``, its variance in ``S_PRED``, and `GaussianUpdate.pending_output_variance`
+    in ``PENDING_VARIANCE``, which is 0 for the first sample: ``HAS_PENDING`` is 1 after it.
     """
     g = GaussianUpdate(model, propagation)
     results: dict[str, str] = {}

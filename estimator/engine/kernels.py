@@ -48,7 +48,7 @@ class BeliefUpdate:
     Attributes:
         update: ``update(W)``: updates the belief of every lane by its rows ``U_k`` and ``Y_<sensor>``.
         layout: row number of each quantity.
-        count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``UNSOUND`` of lanes
+        count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``INDEFINITE_COUNT`` of lanes
             whose covariance is not positive semi-definite; ``update`` does so at its start.
     """
 
@@ -79,7 +79,7 @@ def compile_belief_update(
         keep_trace: write the terms of every iteration's free energy into further rows.
         may_be_missing: outputs that are NaN are missing: the state is predicted, and nothing is updated.
         expectations: how the belief is propagated: ``first_order`` or ``sigma_points`` (`estimator.engine.cubature`).
-            The latter counts indefinite covariances in the row ``UNSOUND``.
+            The latter counts indefinite covariances in the row ``INDEFINITE_COUNT``.
 
     Raises:
         ValueError: for iterations out of range, or other expectations.
@@ -191,8 +191,8 @@ class LinearisedFilter:
 
     Attributes:
         sample: ``sample(W)``: one sample of every lane.
-        layout: row number of each quantity: the coefficients, the input, outputs, ``LIVE``, the noise
-            variances ``Q`` and ``R_<sensor>``, the filter's state and its totals.
+        layout: row number of each quantity: the coefficients, the input, outputs, ``IS_COUNTED``, the noise
+            variances ``PROCESS_VARIANCE`` and ``R_<sensor>``, the filter's state and its totals.
         lanes: lanes of the block.
     """
 
@@ -212,7 +212,7 @@ def compile_linearised_filter(
         degree: degree of the input's polynomial over a sample.
         follows_outputs: whether the filter is updated by outputs, or follows the noise-free response.
         lanes: lanes of a block.
-        variable_step: whether each sample of a differential equation has its own length, in the row ``SPAN``.
+        variable_step: whether each sample of a differential equation has its own length, in the row ``SAMPLE_LENGTH``.
     """
     layout = linearised_filter_layout(model, degree, follows_outputs, variable_step)
 

@@ -27,21 +27,21 @@ def linearised_filter_step(
 ) -> tuple[Assignments, dict[str, str]]:
     """One sample of the filter at known coefficients, as assignments and results by row.
 
-    With Z the sensitivities of the state's mean to the coefficients, A the Jacobian of the next state with respect to
-    the state and B with respect to the coefficients (both in S),
+    With X the sensitivities of the state's mean to the coefficients c, F the Jacobian of the next state with respect to
+    the state and B with respect to the coefficients, q the variance of the process noise and I the Fisher information,
 
-        V⁻ = A V Aᵀ + q N,   Z⁻ = A Z + B;   per sensor  s = h Z⁻ + ∂y/∂c,  F += s sᵀ/S,  Z = Z⁻ - K s.
+        P⁻ = F P Fᵀ + q Q,   X⁻ = F X + B;   per sensor  s = h X⁻ + ∂y/∂c,  I += s sᵀ/S,  X = X⁻ - K s.
 
-    Rows are `filter_state_rows` and `likelihood_total_rows` of `estimator.engine.storage_layout`, the noise variances
-    ``Q`` and ``R_<sensor>``, and ``LIVE``, which is 0 where the sample does not count.
+    Rows are `linearised_filter_rows` and `likelihood_total_rows` of `estimator.engine.storage_layout`, the variances
+    ``PROCESS_VARIANCE`` and ``R_<sensor>``, and ``IS_COUNTED``, which is 0 where the sample does not count.
 
     Args:
         model: the equation.
         propagation: the dynamics over the sample.
         degree: degree of the input's polynomial.
         follows_outputs: update by the outputs ``Y_<sensor>``, or else follow the noise-free response.
-            The latter writes the predicted outputs into ``SHOWN_<sensor>``, and the first one's variance into
-            ``SPREAD``.
+            The latter writes the predicted outputs into ``Y_PRED_<sensor>``, and the first one's variance into
+            ``S_PRED``.
     """
     states, coefficients = list(model.states), list(model.coefficients)
     n, lines = len(states), Program()
@@ -117,9 +117,9 @@ def linearised_filter_step(
 def _predicted_covariance(
     lines: Program, model: Model, propagation: Propagation, follows_outputs: bool
 ) -> dict[tuple[str, str], sp.Expr]:
-    """The upper triangle of F P Fᵀ + q N, by the states' names.
+    """The upper triangle of F P Fᵀ + q Q, by the states' names.
 
-    Integration steps that are too long make N indefinite, and S smaller than R: a hole in the likelihood. So N is
+    Integration steps that are too long make Q indefinite, and S smaller than R: a hole in the likelihood. So Q is
     projected where outputs are followed.
     """
     states = list(model.states)

@@ -19,7 +19,7 @@ from itertools import pairwise
 from typing import Any
 
 from estimator.compilation.simd import number_rows
-from estimator.engine.expected_update import input_history_rows, input_polynomial
+from estimator.engine.expected_update import input_coefficients_from_history, input_history_rows
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import integrator_rows
@@ -40,9 +40,9 @@ class NoiseFreeStep:
     Attributes:
         output_now: ``output_now(W)``: writes the first sensor's output without input into ``NOW``, with its
             ``VELOCITY`` and ``GAIN``.
-        output_after: ``output_after(W)``: writes the output after the sample into ``SHOWN``; the state stays.
-        step: ``step(W)``: one sample; writes ``SHOWN`` and its derivatives ``PHI_<coefficient>``.
-        regressors: ``regressors(W)``: writes the regressors, summed over all states, into ``E_<coefficient>``.
+        output_after: ``output_after(W)``: writes the output after the sample into ``Y_PRED``; the state stays.
+        step: ``step(W)``: one sample; writes ``Y_PRED`` and its derivatives ``PHI_<coefficient>``.
+        regressors: ``regressors(W)``: writes the regressors, summed over all states, into ``REGRESSOR_<coefficient>``.
         linearise: ``linearise(W)``: writes the linear part into ``A_<state>_<state>``.
         layout: row number of each quantity: states, coefficients, inputs and results.
         is_odd: whether rates (or next states) and outputs are odd functions of states and input.
@@ -90,7 +90,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     from estimator.engine import printer_numba, symbolic, variational_rk4
 
     derivatives, symbol = symbolic.differentiate(model), symbolic.symbol
-    input_values = input_polynomial(model, degree, lag)
+    input_values = input_coefficients_from_history(model, degree, lag)
 
     def loop(name: str, doc: str, lines: Any, results: Mapping[str, str], *uniform: str) -> str:
         return printer_numba.print_lane_loop(

@@ -18,7 +18,7 @@ class NoiseIteration(NamedTuple):
         q: assumed variance of the output by process noise.
         r: assumed variance of the sensor noise.
         inverse_innovation_cov: 1/S.
-        scaled_innovation: e/S.
+        scaled_innovation: ν/S.
         gamma_shape: resulting shape of q(γ).
         gamma_rate: resulting rate of q(γ).
         xi_shape: resulting shape of q(ξ).
@@ -41,14 +41,14 @@ def iterate_noise_beliefs(
 ) -> list[NoiseIteration]:
     """Iterate q(γ) and q(ξ) of a sensor (`estimator.engine.gaussian_update` has the formulas).
 
-    Both second moments are sums of positive terms, E[v²] = r (r e²/S² + 1 - r/S). The moment of the process noise is
-    for unit strength, so that no division by hᵀ N h occurs, which may be 0 where the noise depends on the state.
+    Both second moments are sums of positive terms, E[v²] = r (r ν²/S² + 1 - r/S). The moment of the process noise is
+    for unit strength, so that no division by hᵀ Q h occurs, which may be 0 where the noise depends on the state.
 
     Args:
         program: receives the assignments.
         tag: the sensor's number, in their names.
         sensor: the sensor's name.
-        scalars: s, e, hᵀ N h, and whether the output is observed.
+        scalars: hᵀ P⁻ h, ν, hᵀ Q h, and whether the output is observed.
         iterations: number of iterations.
     """
     s, e, output_noise, is_observed = scalars

@@ -108,7 +108,7 @@ def print_lane_loop(
     adjoint = any(row not in layout and row.removeprefix("ADJ_") in layout for row in (*read, *results))
 
     def entry(row: str) -> str:
-        """A row's entry; the adjoint of a row, ``G_<row>``, lies in the same place of the block ``A``."""
+        """A row's entry; the adjoint of a row, ``ADJ_<row>``, lies in the same place of the block ``A``."""
         if shared_rows and row in shared_rows:
             return f"B[{shared_rows[row] * lanes}{' + LANE' if lanes > 1 else ''}]"
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("ADJ_"))
@@ -138,7 +138,7 @@ def print_sample(signature: str, model: Model, finish_call: str, step_function: 
         signature: name and arguments of the function.
         model: the equation; for a difference equation the function is ``finish_call`` alone.
         finish_call: the last call.
-        step_function: name of ``step_function(W, T)``, one Runge-Kutta step from T in [0, 1) of the sample.
+        step_function: name of ``step_function(W, TAU)``, one Runge-Kutta step from TAU in [0, 1) of the sample.
     """
     steps = model.substeps
     body = ["begin(W)", f"for s in range({steps}):", f"    {step_function}(W, s / {steps})"]

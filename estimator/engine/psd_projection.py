@@ -10,9 +10,9 @@ from estimator.engine.symbolic import ONE, ZERO, Program, clip, positive_part, s
 
 
 def project_to_psd(program: Program, noise_cov: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
-    """N if it is positive semi-definite; else its variances, with the covariances clipped to the range they allow.
+    """Q if it is positive semi-definite; else its variances, with the covariances clipped to the range they allow.
 
-    The integrated N is wrong where the Jacobian of the rates exceeds about 3 per step, and may then be indefinite.
+    The integrated Q is wrong where the Jacobian of the rates exceeds about 3 per step, and may then be indefinite.
     """
     n = len(noise_cov)
     entries = {(a, b): noise_cov[a][b] for a in range(n) for b in range(a, n)}

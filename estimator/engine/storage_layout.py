@@ -26,7 +26,7 @@ def input_rows(model: Model, degree: int) -> list[str]:
 
 
 def integrator_rows(model: Model) -> list[str]:
-    """The integrator's quantities in a differential equation: M, S and N, or D where the noise is held.
+    """The integrator's quantities in a differential equation: M, F and Q, or NOISE_INPUT where the noise is held.
 
     Empty for a difference equation.
     """
@@ -67,8 +67,8 @@ def trace_rows(model: Model, iterations: int) -> list[str]:
     return names
 
 
-def filter_state_rows(model: Model) -> list[str]:
-    """State of the linearised filter: mean, covariance V, and sensitivities Z to the coefficients."""
+def linearised_filter_rows(model: Model) -> list[str]:
+    """State of the linearised filter: mean, covariance P, and sensitivities DX to the coefficients."""
     sensitivities = [f"DX_{i}_{c}" for i in model.states for c in model.coefficients]
     return [*model.states, *upper_triangle_names("P", model.states), *sensitivities]
 
@@ -86,7 +86,7 @@ def likelihood_total_rows(model: Model) -> list[str]:
 def linearised_filter_layout(
     model: Model, degree: int, follows_outputs: bool, variable_step: bool = False
 ) -> dict[str, int]:
-    """Rows of the linearised filter's block; ``SPAN`` is the length of a sample, if it varies."""
+    """Rows of the linearised filter's block; ``SAMPLE_LENGTH`` is the length of a sample, if it varies."""
     seen = [f"{what}_{y}" for what in ("Y", "Y_PRED", "HPH") for y in model.outputs]
     shown = seen if follows_outputs else [*(f"Y_PRED_{y}" for y in model.outputs), "S_PRED"]
     given = [
@@ -98,4 +98,4 @@ def linearised_filter_layout(
         *(f"R_{y}" for y in model.outputs),
     ]
     given += ["SAMPLE_LENGTH"] if variable_step else []
-    return number_rows(*filter_state_rows(model), *likelihood_total_rows(model), *given, *integrator_rows(model))
+    return number_rows(*linearised_filter_rows(model), *likelihood_total_rows(model), *given, *integrator_rows(model))

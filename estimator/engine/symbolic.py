@@ -6,9 +6,9 @@ begin with a capital letter:
 
 ==========  ===========================================================================================
 ``M_i``     state i after the sample, before its process noise
-``S_i_j``   its derivative with respect to quantity j (a state before the sample, or a coefficient)
-``N_i_k``   covariance of states i and k by process noise of unit strength
-``P_i_j``   covariance of quantities i and j before the sample; ``Q_i_j`` is the predicted one
+``F_i_j``   its derivative with respect to quantity j (a state before the sample, or a coefficient)
+``Q_i_k``   covariance of states i and k by process noise of unit strength
+``P_i_j``   covariance of quantities i and j before the sample; ``P_PRED_i_j`` is the predicted one
 ``U_k``     input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
 ==========  ===========================================================================================
 """
@@ -164,9 +164,9 @@ class Propagation:
 
     Attributes:
         state: M, the state after the sample.
-        jacobian: S; empty if the predicted covariance is given as ``Q_i_j`` instead of S P Sᵀ.
-        noise_cov: N, the covariance of process noise of unit strength.
-        is_psd: whether N is positive semi-definite by construction.
+        jacobian: F; empty if the predicted covariance is given as ``P_PRED_i_j`` instead of F P Fᵀ.
+        noise_cov: Q, the covariance of process noise of unit strength.
+        is_psd: whether Q is positive semi-definite by construction.
     """
 
     state: tuple[sp.Expr, ...]
@@ -176,7 +176,7 @@ class Propagation:
 
 
 def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagation]:
-    """M, S and N of a difference equation: the next state and its derivatives."""
+    """M, F and Q of a difference equation: the next state and its derivatives."""
     c = differentiate(model)
     inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
@@ -224,13 +224,13 @@ def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
 def runge_kutta_4(
     variables: Sequence[str], rate_assignments: Assignments, substeps: int, sample_length: sp.Expr = sp.S.One
 ) -> Assignments:
-    """One Runge-Kutta step of order 4, from ``variables`` to ``<name>_E``.
+    """One Runge-Kutta step of order 4, from ``variables`` to ``<name>_END``.
 
     Names of its four stages end with ``_A`` to ``_D``, which no name of a model does.
 
     Args:
         variables: names that are integrated.
-        rate_assignments: assignments of their rates ``K_<name>`` in the names and the input ``u``.
+        rate_assignments: assignments of their rates ``RATE_<name>`` in the names and the input ``u``.
         substeps: steps per sample.
         sample_length: length of the sample, in sampling steps.
     """
@@ -263,7 +263,7 @@ def runge_kutta_4(
 
 
 def input_at_stages(degree: int, substeps: int) -> Assignments:
-    """``V_A``, ``V_B``, ``V_D``: the input at the start, middle and end of a Runge-Kutta step."""
+    """``U_AT_A``, ``U_AT_B``, ``U_AT_D``: the input at the start, middle and end of a Runge-Kutta step."""
     h = sp.Rational(1, substeps)
     lines = []
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
@@ -317,7 +317,7 @@ def input_at_end(model: Model, degree: int) -> sp.Expr:
 def reverse_mode_derivative(
     assignments: Assignments, inputs: Sequence[str], result_adjoints: Mapping[str, str]
 ) -> Assignments:
-    """Reverse-mode differentiation of assignments: adjoints ``G_<name>`` of ``inputs``.
+    """Reverse-mode differentiation of assignments: adjoints ``ADJ_<name>`` of ``inputs``.
 
     Args:
         assignments: forward, each name assigned once.

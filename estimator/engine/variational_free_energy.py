@@ -18,7 +18,7 @@ def half_noise_powers(scaled_innovation, inverse_innovation_variance, q, r):
     Args:
         scaled_innovation: the innovation divided by its variance.
         inverse_innovation_variance: inverse of the innovation's variance with q and r.
-        q: variance of the output by process noise, hᵀ N h / E[γ].
+        q: variance of the output by process noise, hᵀ Q h / E[γ].
         r: variance of the sensor noise, 1/E[ξ].
     """
     w = q * scaled_innovation

@@ -1,12 +1,13 @@
 """Runge-Kutta integration of a differential equation with its variational equations and process noise covariance.
 
-The sensitivities S follow the exact derivative of the step's arithmetic, which is linear in them. With J the Jacobian
-of the rates at a stage, by states and coefficients, and H the derivative of the step's end by the rates of that stage,
+The sensitivities F follow the exact derivative of the step's arithmetic, which is linear in them. With J the Jacobian
+of the rates at a stage, by states and coefficients, and H (``END_BY_RATE``) the derivative of the step's end by the
+rates of that stage,
 
     H_D = h/6,   H_C = h/3 + h H_D J_D,   H_B = h/3 + h/2 H_C J_C,   H_A = h/6 + h/2 H_B J_B,
-    S_E = S + Σ H J [S; 1].
+    F_END = F + Σ H J [F; 1].
 
-Integrating every column of S through the stages would be twice the work, and exceed the registers.
+Integrating every column of F through the stages would be twice the work, and exceed the registers.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def print_integrator(
     input_values: Mapping[str, Any] | None = None,
     sample_length: sp.Expr = sp.S.One,
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, T)``, which integrate a sample.
+    """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample.
 
     Args:
         model: the equation; the source is empty for a difference equation.
@@ -76,12 +77,12 @@ def print_integrator(
     source = printer_numba.print_lane_loop(
         "begin", [], start, layout, lanes, doc="The integrator at the start of a sample."
     )
-    doc = "One Runge-Kutta step, from T in [0, 1) of the sample on."
+    doc = "One Runge-Kutta step, from TAU in [0, 1) of the sample on."
     return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("TAU",), doc)
 
 
 def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.S.One) -> Assignments:
-    """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_E``."""
+    """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_END``."""
     states, h = list(model.states), sample_length * sp.Rational(1, model.substeps)
     stage, slopes = _stage_rates_and_slopes(model)
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
@@ -114,7 +115,7 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
 
 
 def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
-    """Rates ``K_<name>`` of the state and its noise covariance, and the Jacobian of the state's rates.
+    """Rates ``RATE_<name>`` of the state and its noise covariance, and the Jacobian of the state's rates.
 
     Entries of the Jacobian that differ between the stages are assigned too, as ``J_<state>_<quantity>``.
     """
@@ -159,12 +160,12 @@ def coarse_trajectory(model: Model, degree: int) -> tuple[Assignments, dict[str,
 
 
 def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic.Propagation]:
-    """M, S and N of a predicted sample of a differential equation, along `coarse_trajectory`.
+    """M, F and Q of a predicted sample of a differential equation, along `coarse_trajectory`.
 
     The sensitivities take one step, with the Jacobians at the start, middle and end of the sample. With H of its stages
-    and g the coefficient of unit noise in the rates, N follows Simpson's rule:
+    and g the coefficient of unit noise in the rates, Q follows Simpson's rule:
 
-        N = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
+        Q = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
     states = list(model.states)
     lines = Program(symbolic.substitute(input_at_stages(degree, 1), {"TAU": sp.S.Zero}))

@@ -1,4 +1,4 @@
-"""Steps of the filter loop for the members of a noise grid, about one linearisation (`estimator.engine.shared_update`)."""
+"""Steps of the filter loop for members of a noise grid about one linearisation (`estimator.engine.shared_update`)."""
 
 from __future__ import annotations
 

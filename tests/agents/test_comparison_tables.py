@@ -21,12 +21,7 @@ from agents.evaluation.comparison_tables import (
     print_headline_table,
     write_evaluations,
 )
-from agents.evaluation.figures import (
-    plot_inputs_and_outputs,
-    plot_learning_curve,
-    plot_posterior_contraction,
-    save_png,
-)
+from agents.evaluation.figures import plot_inputs_and_outputs, plot_learning_curve, plot_log_posterior_gain, save_png
 from agents.evaluation.metric_summary import METRIC_COLUMNS, summarise_metrics
 from agents.evaluation.policy_rollout import Evaluation
 from estimator import SILVERBOX_SAMPLING_STEP
@@ -366,7 +361,7 @@ def test_compare_writes_what_it_prints(tmp_path, capsys):
 @table("policies", [1, 10])
 def test_contraction_shows_the_quartiles_of_every_policy(policies):
     evaluations = [make_evaluation(str(i), seed=i) for i in range(policies)]
-    figure = plot_posterior_contraction(evaluations, "title")
+    figure = plot_log_posterior_gain(evaluations, "title")
     (axes,), (legend,) = figure.axes, figure.legends
     assert axes.get_title() == "title"
     assert "nat" in axes.get_ylabel()
@@ -381,7 +376,7 @@ def test_contraction_shows_the_quartiles_of_every_policy(policies):
 
 
 def test_contraction_shows_losses_too():
-    gains, losses = (plot_posterior_contraction([make_evaluation(shift=shift)]).axes[0] for shift in (0.0, -40.0))
+    gains, losses = (plot_log_posterior_gain([make_evaluation(shift=shift)]).axes[0] for shift in (0.0, -40.0))
     assert gains.get_ylim()[0] == 0.0
     low, high = losses.get_ylim()
     assert low < high
@@ -422,7 +417,7 @@ def test_pictures_are_written(tmp_path):
     save_png(plot_learning_curve(curve, "information_gain"), tmp_path / "curve.png")
     check_picture(tmp_path / "curve.png", 840, 480)
     evaluations = [make_evaluation(str(i), seed=i, shift=3.0 * i) for i in range(4)]
-    save_png(plot_posterior_contraction(evaluations, "title"), tmp_path / "contraction.png")
+    save_png(plot_log_posterior_gain(evaluations, "title"), tmp_path / "contraction.png")
     check_picture(tmp_path / "contraction.png", 900, 592, colours=4)  # two lines of names
     save_png(plot_inputs_and_outputs(evaluations), tmp_path / "excitations.png")
     check_picture(tmp_path / "excitations.png", 1440, 864, colours=4)

@@ -10,7 +10,7 @@ from tables import table
 from agents.planning.d_optimality import NominalSystem, compile_d_optimality, half_log_det, invert_from_cholesky
 from agents.planning.projected_gradient import DesignLimits, compile_projected_gradient
 from estimator import SILVERBOX_TWIN, silverbox_prior
-from estimator.engine.adjoint import compile_adjoint
+from estimator.engine.information_gradient import compile_adjoint
 from estimator.inference.fisher_information import fisher_information
 from estimator.models.difference_equation import difference
 from estimator.rigs.physical_parameters import coefficients_of

@@ -14,8 +14,8 @@ from agents.policies.networks.policy_saving import save_policy
 from agents.policies.networks.trained_policy import load_policy
 from agents.sb3_vec_env import DuffingVecEnv
 from agents.training import ALGORITHMS, PPOSettings, TrainConfig, train
+from agents.training.dagger_pretraining import imitate_policy
 from agents.training.environments.feature_vec_env import REWARD_SCALE, FeatureNormalizer, FeatureVecEnv
-from agents.training.imitation import imitate_policy
 from agents.training.training_logs import TrainingCallback
 
 AMPLITUDE, POWER = "duffing_env/Amplitude-v0", "duffing_env/Power-v0"

@@ -17,7 +17,7 @@ from agents.commands.identify_command import print_identification as show_identi
 from agents.commands.rig_file_builder import rig_text_from_record
 from agents.console_output import format_table, print_texts_and_tables
 from agents.evaluation.comparison_tables import ComparisonSettings, print_comparison_table
-from agents.evaluation.figures import plot_inputs_and_outputs, plot_posterior_contraction, save_png
+from agents.evaluation.figures import plot_inputs_and_outputs, plot_log_posterior_gain, save_png
 from agents.evaluation.html_report import write_html_report
 from agents.evaluation.policy_evaluation import evaluate_policies
 from agents.hardware.next_experiment import design_experiment
@@ -73,9 +73,9 @@ def test_policies_in_pages_and_figures(evaluation, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of layouts that have no room
         write_html_report(tmp_path / "report.html", named, settings, ["evaluate.py", *SHARP])
-        for figure in (plot_posterior_contraction(named), plot_inputs_and_outputs(named)):
+        for figure in (plot_log_posterior_gain(named), plot_inputs_and_outputs(named)):
             save_png(figure, tmp_path / "figure.png")
-        (legend,) = plot_posterior_contraction(named).legends
+        (legend,) = plot_log_posterior_gain(named).legends
     assert len(legend.get_texts()) == len(SHARP)
     page = Elements((tmp_path / "report.html").read_text())
     assert not page.found & {"script", "img", "b", "onerror"}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from duffing_env.batch import spawn_seeds
-from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.rewards.named_rewards import REWARDS
 from estimator import SILVERBOX_SAMPLING_STEP
 
 TRACK, SYSTEMS, SAMPLES = "duffing_env/Amplitude-v0", 8, 256
@@ -66,7 +66,7 @@ def test_it_does_so_where_the_reward_is_paid_at_the_end():
 
 
 def test_what_was_gained_before_the_end_is_kept_otherwise():
-    # The figures of `duffing_env.rewards.reward_registry`.
+    # The figures of `duffing_env.rewards.named_rewards`.
     returned, ended = returns("information_gain", STANDARD)
     assert ended[-2].all()
     assert returned[-2].mean() == pytest.approx(15.2, abs=0.05)

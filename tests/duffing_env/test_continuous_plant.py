@@ -8,7 +8,7 @@ from reference.filters import continuous_step
 from scipy.integrate import solve_ivp
 from twin import to_rates
 
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw
 from duffing_env.kernel_stages.sample_stages import compile_simulation
 from duffing_env.storage.kernel_spec import block_layout

@@ -57,7 +57,7 @@ def test_a_promise_is_for_the_sample_and_not_for_what_drift_forgets():
 
 def test_promises_are_kept_on_average_by_calibrated_beliefs():
     promised, gained = (np.nansum(column, axis=0) for column in sums())
-    assert promised.mean() == pytest.approx(17.79, abs=0.01)  # the figures of `duffing_env.rewards.reward_registry`
+    assert promised.mean() == pytest.approx(17.79, abs=0.01)  # the figures of `duffing_env.rewards.named_rewards`
     assert abs((promised - gained).mean()) < 0.05
 
 

@@ -14,7 +14,7 @@ from specimens import VOLTS, Difference, around
 
 from agents import make_policy
 from duffing_env.env import DuffingEnv
-from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.rewards.named_rewards import REWARDS
 from duffing_env.tracks.rig_env import RigEnv
 from estimator import Channel, OnlineEstimator, Rig
 from estimator.belief import Belief

@@ -13,7 +13,7 @@ from duffing_env.batch import Batch, spawn_seeds
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY, RESET_NEXT_STEP, RESET_SAME_STEP
-from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.rewards.named_rewards import REWARDS
 from duffing_env.storage.kernel_spec import observation_bounds
 from estimator import SILVERBOX_TWIN
 from estimator.models.difference_equation import difference

@@ -6,7 +6,7 @@ from rounding import U64
 from twin import to_coefficients
 
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import compile_noise_draw, replay_sample
 from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_TWIN

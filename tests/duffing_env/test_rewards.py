@@ -8,9 +8,9 @@ from scipy.stats import multivariate_normal
 from twin import to_coefficients, to_parameters
 
 from duffing_env.experiment_config import SimulatedExperiment
-from duffing_env.kernel_stages.generated_model_functions import generated_functions
+from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.plant_stages import pay_reward
-from duffing_env.rewards.reward_registry import REWARDS, check_reward
+from duffing_env.rewards.named_rewards import REWARDS, check_reward
 from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_SAMPLING_STEP, SILVERBOX_TWIN, Parameters
 from estimator.belief import Belief

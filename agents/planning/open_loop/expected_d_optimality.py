@@ -3,7 +3,7 @@
     J(u) = mean_k [½ log det(Λ + F_k(u)) - ρ Σ_t max(0, |x_k(t)| / L - 1)²]
 
 Term k is `agents.planning.d_optimality`'s criterion for a system with its own coefficients, start, noises and
-disturbances. Each lane follows one system (`estimator.engine.adjoint_simd`).
+disturbances. Each lane follows one system (`estimator.engine.information_gradient_simd`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy.typing as npt
 from agents.planning.d_optimality import DIVERGED_RATIO, half_log_det, invert_from_cholesky
 from estimator.compilation.array_operations import fill
 from estimator.compilation.simd import LANES, jit_closure, kernel
-from estimator.engine.adjoint_simd import compile_lane_adjoint
+from estimator.engine.information_gradient_simd import compile_lane_adjoint
 from estimator.engine.input_hold import n_older_inputs
-from estimator.engine.storage_layout import filter_state_rows, input_rows
+from estimator.engine.storage_layout import input_rows, linearised_filter_rows
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -142,7 +142,7 @@ def _layout(model: Model, degree: int) -> _Layout:
         LIVE=at["IS_COUNTED"],
         size=len(lane_paths.layout) * LANES,
         n_tape=lane_paths.n_tape,
-        n_path=len(filter_state_rows(model)),
+        n_path=len(linearised_filter_rows(model)),
         n_inputs=len(input_rows(model, degree)),
         n_older=n_older_inputs(model, degree),
         k=k,

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from estimator.identification.data.column_names import SECONDS_OF_TIME_UNIT, name_without_unit, unit_in_name
+from estimator.identification.data.column_units import SECONDS_OF_TIME_UNIT, name_without_unit, unit_in_name
 from estimator.identification.data.column_words import first_word, role_in_name
 from estimator.rigs.units import normalise_unit, to_si_unit
 

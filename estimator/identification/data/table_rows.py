@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from estimator.identification.data.column_names import is_unit
+from estimator.identification.data.column_units import is_unit
 from estimator.identification.data.text_fields import (
     DECIMAL_COMMA_SEPARATORS,
     parse_number,

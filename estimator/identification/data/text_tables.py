@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.identification.data.column_choice import ColumnNames, choose_columns
-from estimator.identification.data.column_names import append_unit, seconds_per_time_unit, unit_in_name
+from estimator.identification.data.column_units import append_unit, seconds_per_time_unit, unit_in_name
 from estimator.identification.data.column_words import sensor_kind_in_name
 from estimator.identification.data.table_rows import (
     TableValue,

@@ -6,7 +6,7 @@ from engine_cases import CASES, FIVE, block, put, random_inputs
 from reference.filters import EPS, central, moved, path, spread
 from tables import table
 
-from estimator.engine import adjoint, kernels
+from estimator.engine import information_gradient, kernels
 from estimator.engine.storage_layout import input_rows
 
 SAMPLES = 12
@@ -152,11 +152,11 @@ def test_the_information_is_that_of_the_responses_slopes(name):
 def pieces_of(case, name, monkeypatch):
     """The adjoint: compiled for two equations, and as plain Python for the others."""
     if name in ("paper", "pendulum"):
-        return adjoint.compile_adjoint(case.model, case.degree)
+        return information_gradient.compile_adjoint(case.model, case.degree)
     with monkeypatch.context() as plain:
         plain.setattr("estimator.engine.source_cache.jit_closure", lambda _: lambda function: function)
         plain.setattr("estimator.engine.source_cache.scalar_jit_from_source", lambda _: lambda function: function)
-        return adjoint.compile_adjoint.__wrapped__(case.model, case.degree)
+        return information_gradient.compile_adjoint.__wrapped__(case.model, case.degree)
 
 
 @pytest.mark.parametrize("name", [*FIVE, "drag"])

@@ -8,7 +8,7 @@ from itertools import combinations
 from typing import Any
 
 from duffing_env.rewards.log_determinant import log_det_and_density
-from duffing_env.rewards.reward_registry import REWARDS
+from duffing_env.rewards.named_rewards import REWARDS
 from duffing_env.storage.kernel_spec import (
     KernelSpec,
     block_layout,

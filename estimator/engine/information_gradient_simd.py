@@ -1,7 +1,7 @@
 """Gradient of the predicted Fisher information with respect to shared inputs, for many systems in SIMD lanes.
 
-The arithmetic is the same as in `estimator.engine.adjoint`. All lanes take the same inputs; each has its own
-coefficients, noises and start.
+The arithmetic is the same as in `estimator.engine.information_gradient`. All lanes take the same inputs; each has its
+own coefficients, noises and start.
 """
 
 from __future__ import annotations
@@ -12,10 +12,15 @@ from functools import cache
 from typing import Any
 
 from estimator.compilation.simd import LANES
-from estimator.engine.adjoint import with_reverse
+from estimator.engine.information_gradient import with_reverse
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
-from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, linearised_filter_layout
+from estimator.engine.storage_layout import (
+    input_rows,
+    integrator_rows,
+    linearised_filter_layout,
+    linearised_filter_rows,
+)
 from estimator.models.model import Model
 
 
@@ -42,7 +47,7 @@ class LaneAdjoint:
 
 @cache
 def compile_lane_adjoint(model: Model, degree: int = 0) -> LaneAdjoint:
-    """Compile the adjoint of a model in SIMD lanes; arguments as `estimator.engine.adjoint.compile_adjoint`."""
+    """Compile the adjoint in SIMD lanes; arguments as `estimator.engine.information_gradient.compile_adjoint`."""
     place = linearised_filter_layout(model, degree, follows_outputs=False)
     key = repr((model.digest, degree))
     code = load_generated(model.name, "gradient-lanes", key, lambda: _source(model, degree, place), RUNTIME_FUNCTIONS)
@@ -53,7 +58,7 @@ def _source(model: Model, degree: int, layout: Mapping[str, int]) -> str:
     from estimator.engine import printer_numba, symbolic, variational_rk4
     from estimator.engine.linearised_filter import linearised_filter_step
 
-    path_rows, integrated, inputs = filter_state_rows(model), integrator_rows(model), input_rows(model, degree)
+    path_rows, integrated, inputs = linearised_filter_rows(model), integrator_rows(model), input_rows(model, degree)
     lines, propagation = symbolic.propagate_sample(model)
     more, results = linearised_filter_step(model, propagation, degree, follows_outputs=False)
     lines = [*lines, *more]

@@ -78,9 +78,9 @@ class Reward:
             decrease of the parameter error, and row ``HOOK_REWARD``, which the hooks write.
         needs_truth: whether it compares with the true plant.
         compile_hooks: ``compile_hooks(spec, generated)`` makes the hooks, of the functions that are generated for an
-            environment (`duffing_env.kernel_stages.generated_model_functions`); None for a reward without hooks.
+            environment (`duffing_env.kernel_stages.generated_environment_functions`); None for a reward without hooks.
         hook_source: ``hook_source(spec, loop)`` is the source of what the hooks need among these functions, by the loop
-            printer of `duffing_env.kernel_stages.generated_model_functions`; None where they need nothing.
+            printer of `duffing_env.kernel_stages.generated_environment_functions`; None where they need nothing.
     """
 
     weights: tuple[float, float, float, float]

@@ -14,7 +14,7 @@ from typing import Any
 
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
-from estimator.engine.storage_layout import filter_state_rows, input_rows, integrator_rows, likelihood_total_rows
+from estimator.engine.storage_layout import input_rows, integrator_rows, likelihood_total_rows, linearised_filter_rows
 from estimator.models.model import Model
 
 
@@ -22,7 +22,7 @@ from estimator.models.model import Model
 class Adjoint:
     """Compiled functions of the linearised filter along the noise-free response, forward and backward.
 
-    P is the filter's state: states, covariance (upper triangle) and sensitivities (row by row). F is the upper triangle
+    P is the filter's state: means, covariance (upper triangle) and sensitivities (row by row). F is the upper triangle
     of the Fisher information, C the coefficients, U the input over a sample, N the noise variances. G and H are the
     adjoints of P and F. A tape (T, n_tape) stores the start of every sample.
 
@@ -75,7 +75,7 @@ def _source(model: Model, degree: int) -> str:
     from estimator.engine.linearised_filter import linearised_filter_step
 
     coefficients, integrated = list(model.coefficients), integrator_rows(model)
-    path_rows, inputs = filter_state_rows(model), input_rows(model, degree)
+    path_rows, inputs = linearised_filter_rows(model), input_rows(model, degree)
     information = [row for row in likelihood_total_rows(model) if row.startswith("INFORMATION_")]
     noises = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)]
     shown = f"Y_PRED_{next(iter(model.outputs))}"
@@ -162,12 +162,12 @@ def with_reverse(
 
     Args:
         lines: the forward assignments.
-        results: row to the name of its value. The adjoint of a row is ``G_<row>``.
+        results: row to the name of its value. The adjoint of a row is ``ADJ_<row>``.
         inputs: rows whose adjoints are wanted.
         accumulated: rows among ``inputs`` whose adjoints are added to an earlier value.
 
     Returns:
-        All assignments, and ``G_<row>`` of each input to the name of its value.
+        All assignments, and ``ADJ_<row>`` of each input to the name of its value.
     """
     from estimator.engine import printer_numba, symbolic
 
