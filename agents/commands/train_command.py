@@ -15,9 +15,9 @@ from agents.training import (
     ALGORITHMS,
     TrainConfig,
     TrainingSubject,
-    multi_seed_training,
     resume,
     train,
+    train_seeds,
     tune_hyperparameters,
 )
 from agents.training.environments.oscillator_family import FAMILY
@@ -92,7 +92,7 @@ class TrainCommand(TrainConfig):
             return
         if self.seeds > 1:
             with add_resume_hint(lambda hint: _REPEAT_COMMAND_HINT):
-                for folder in multi_seed_training(self, self.seeds, on_ray=self.ray):
+                for folder in train_seeds(self, self.seeds, on_ray=self.ray):
                     print_in_80_columns(f"The run is in {folder}")
                     sys.stdout.flush()
             self._compare(f"{self.algo}={folder.parent}/[0-9]*", self, folder.parent)

@@ -8,7 +8,7 @@ import pytest
 from tables import table
 
 from agents.commands.train_command import main
-from agents.training import PPOSettings, TrainConfig, multi_seed_training, train, tune_hyperparameters
+from agents.training import PPOSettings, TrainConfig, train, train_seeds, tune_hyperparameters
 from agents.training.multi_seed_training import train_or_resume
 
 ENV = "duffing_env/Short-v0"
@@ -29,7 +29,7 @@ def weights(folder):
 
 @pytest.mark.parametrize("on_ray", [False, pytest.param(True, marks=[needs_ray, pytest.mark.filterwarnings("ignore")])])
 def test_each_seed_is_the_training_of_that_seed_alone(tmp_path, on_ray):
-    folders = sorted(multi_seed_training(config(tmp_path / "all", seed=3), 2, on_ray=on_ray))
+    folders = sorted(train_seeds(config(tmp_path / "all", seed=3), 2, on_ray=on_ray))
     assert folders == [tmp_path / "all" / "3", tmp_path / "all" / "4"]
     for folder in folders:
         alone = train(config(tmp_path / f"alone-{folder.name}", seed=int(folder.name))).folder
@@ -44,9 +44,9 @@ def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "agents.training.multi_seed_training.train_or_resume", lambda run: carried.append(run) or train_or_resume(run)
     )
-    assert len(list(multi_seed_training(config(tmp_path), 1))) == 1
+    assert len(list(train_seeds(config(tmp_path), 1))) == 1
     before = (tmp_path / "0" / "policy.json").stat().st_mtime_ns
-    assert len(list(multi_seed_training(config(tmp_path), 2))) == 2
+    assert len(list(train_seeds(config(tmp_path), 2))) == 2
     assert (tmp_path / "0" / "policy.json").stat().st_mtime_ns == before
     assert [run.seed for run in carried] == [0, 0, 1]
     message = r"the folder of the same command, but in .*0/config.json reward is 'information_gain' instead of 'fisher'"
@@ -89,7 +89,7 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
         "estimator.support.optional_dependencies.find_spec", lambda name: None if name == "ray" else name
     )
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'duffing-env\[ray\]'"):
-        list(multi_seed_training(config(tmp_path), 2, on_ray=True))
+        list(train_seeds(config(tmp_path), 2, on_ray=True))
 
 
 @needs_ray
@@ -108,4 +108,4 @@ def test_what_a_task_raises_is_told_as_it_is(tmp_path):
     checkpoint.mkdir(parents=True)
     (checkpoint / "training.json").write_text("{")
     with pytest.raises(ValueError, match=r"checkpoint must hold a sound training.json"):
-        list(multi_seed_training(config(tmp_path), 2, on_ray=True))
+        list(train_seeds(config(tmp_path), 2, on_ray=True))
