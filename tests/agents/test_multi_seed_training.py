@@ -51,23 +51,23 @@ def test_the_same_call_goes_on_and_another_is_refused(tmp_path, monkeypatch):
     assert [run.seed for run in carried] == [0, 0, 1]
     message = r"the folder of the same command, but in .*0/config.json reward is 'information_gain' instead of 'fisher'"
     with pytest.raises(ValueError, match=message):
-        list(multi_seed_training(replace(config(tmp_path), reward="fisher"), 2))
+        list(train_seeds(replace(config(tmp_path), reward="fisher"), 2))
     other = replace(config(tmp_path), hyperparameters=replace(TINY, gamma=0.5))
     with pytest.raises(ValueError, match=r"hyperparameters.gamma is 0.99 instead of 0.5; name another folder"):
-        list(multi_seed_training(other, 2))
+        list(train_seeds(other, 2))
 
 
 def test_what_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
     first = train(config(tmp_path / "a" / "first")).folder
     begun = config(tmp_path / "a" / "all", begin=first)
-    assert next(multi_seed_training(begun, 2)) == tmp_path / "a" / "all" / "0"  # and the second is not trained
+    assert next(train_seeds(begun, 2)) == tmp_path / "a" / "all" / "0"  # and the second is not trained
     (tmp_path / "a").rename(tmp_path / "b")
     moved = config(tmp_path / "b" / "all", begin=tmp_path / "b" / "first")
-    folders = list(multi_seed_training(moved, 2))
+    folders = list(train_seeds(moved, 2))
     assert [(folder / "policy.json").is_file() for folder in folders] == [True, True]
     assert not (tmp_path / "a").exists()
     with pytest.raises(ValueError, match=r"0/config.json begin is '../../first' instead of '../../other'"):
-        list(multi_seed_training(replace(moved, begin=tmp_path / "b" / "other"), 2))
+        list(train_seeds(replace(moved, begin=tmp_path / "b" / "other"), 2))
 
 
 @table(

@@ -182,5 +182,5 @@ def test_command_with_nowhere_to_write(record, tmp_path):
 def test_command_explains_every_option():
     finished = command("--help")
     assert finished.returncode == 0
-    for word in ("--json", "--figures", "--data", "machine-readable", "two figures", "SNLS80mV.csv"):
+    for word in ("--json", "--figures", "--data", "JSON file", "two figures", "SNLS80mV.csv"):
         assert word in finished.stdout
