@@ -18,11 +18,7 @@ from estimator.support.optional_dependencies import require_packages
 
 require_packages("stable_baselines3")
 from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
-from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
-    VecEnvIndices,
-    VecEnvObs,
-    VecEnvStepReturn,
-)
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn  # noqa: E402
 
 _TRUNCATED = "TimeLimit.truncated"
 

@@ -48,12 +48,7 @@ UNIT = "µs/sample"
 BAR = 5.0
 """Ours is to be this many times as fast per sample as dynamax's filter with the same model."""
 
-MODELS = {
-    "ode": "ODE linear",
-    "three-tap": "NLARX three-tap",
-    "cubic": "NLARX cubic",
-    "paper": "paper structured",
-}
+MODELS = {"ode": "ODE linear", "three-tap": "NLARX three-tap", "cubic": "NLARX cubic", "paper": "paper structured"}
 """By the name that a request has: the setting of ours."""
 
 PEERS = {

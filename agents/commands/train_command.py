@@ -11,15 +11,7 @@ import tyro
 from agents.cli import one_line_errors, parse_arguments
 from agents.console_output import print_in_80_columns, print_warning
 from agents.interruption import add_resume_hint
-from agents.training import (
-    ALGORITHMS,
-    TrainConfig,
-    TrainingSubject,
-    resume,
-    train,
-    train_seeds,
-    tune_hyperparameters,
-)
+from agents.training import ALGORITHMS, TrainConfig, TrainingSubject, resume, train, train_seeds, tune_hyperparameters
 from agents.training.environments.oscillator_family import FAMILY
 from agents.training.run_folder import LEARNING_CURVE_FILE, UNTRAINED_FOLDER
 from estimator.support.argument_checks import check_integer

@@ -215,11 +215,7 @@ def _play(run: _PreparedRun, session: Session, recording: Recording, on_progress
 
 
 def _play_blocks(
-    run: _PreparedRun,
-    session: Session,
-    recording: Recording,
-    on_progress: Callable[[int], None],
-    ending: _Ending,
+    run: _PreparedRun, session: Session, recording: Recording, on_progress: Callable[[int], None], ending: _Ending
 ) -> None:
     """Listen, then design and play block by block; a plant that plays blocks misses no tick."""
     settings, rng = run.settings, np.random.default_rng(run.settings.seed)
@@ -231,11 +227,7 @@ def _play_blocks(
 
 
 def _play_samples(
-    run: _PreparedRun,
-    session: Session,
-    recording: Recording,
-    on_progress: Callable[[int], None],
-    ending: _Ending,
+    run: _PreparedRun, session: Session, recording: Recording, on_progress: Callable[[int], None], ending: _Ending
 ) -> None:
     """Listen, design a signal where the policy is one, arm, and play against the clock."""
     settings, rng = run.settings, np.random.default_rng(run.settings.seed)

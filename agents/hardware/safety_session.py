@@ -71,12 +71,7 @@ class Session:
     """
 
     def __init__(
-        self,
-        plant: HardwarePlant,
-        rig: Rig,
-        log_event: EventLog,
-        watchdog: float | None,
-        max_stale: int = 32,
+        self, plant: HardwarePlant, rig: Rig, log_event: EventLog, watchdog: float | None, max_stale: int = 32
     ) -> None:
         check_safety_settings(rig, plant, watchdog)
         self.plant, self.watchdog, self.max_stale = plant, watchdog, max_stale

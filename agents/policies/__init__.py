@@ -29,11 +29,7 @@ class Policy(Protocol):
     """A policy: Stable-Baselines3's `predict`, on one observation or on a batch."""
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = False,
+        self, observation: Any, state: Any = None, episode_start: ArrayLike | None = None, deterministic: bool = False
     ) -> tuple[NDArray[Any], Any]:
         """Chooses the action.
 

@@ -12,11 +12,7 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from agents.planning.model_probe import observation_layout
-from agents.planning.open_loop.chance_constrained_block import (
-    MAX_PLANNED_DRAWS,
-    optimise_block,
-    sampled_systems,
-)
+from agents.planning.open_loop.chance_constrained_block import MAX_PLANNED_DRAWS, optimise_block, sampled_systems
 from agents.planning.open_loop.initial_guesses import initial_guesses
 from agents.planning.open_loop.posterior_samples import (
     MonteCarloSystems,

@@ -14,13 +14,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.rigs.bench_catalogue import N_SAMPLES, PARAMETERS, Bench
-from benchmarks.rigs.dop853_simulator import (
-    SENSOR_KINDS,
-    FloatArray,
-    output_derivatives,
-    simulate,
-    state_sensitivities,
-)
+from benchmarks.rigs.dop853_simulator import SENSOR_KINDS, FloatArray, output_derivatives, simulate, state_sensitivities
 
 #: Largest relative error of a guess.
 MAX_GUESS_ERROR = 0.3

@@ -58,12 +58,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from duffing_env.rewards import (
-    expected_free_energy_reward,
-    fisher_reward,
-    free_energy_reward,
-    simulation_error_reward,
-)
+from duffing_env.rewards import expected_free_energy_reward, fisher_reward, free_energy_reward, simulation_error_reward
 from duffing_env.rewards.reward_hooks import NO_HOOKS, RewardHooks
 from duffing_env.storage.kernel_spec import KernelSpec
 from estimator.support.argument_checks import did_you_mean

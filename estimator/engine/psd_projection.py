@@ -22,8 +22,7 @@ def project_to_psd(program: Program, noise_cov: Sequence[Sequence[sp.Expr]]) -> 
     for a in range(n - 1):
         for b in range(a + 1, n):
             largest = program.assign(
-                f"Q_LIMIT_{a}_{b}",
-                sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b])),
+                f"Q_LIMIT_{a}_{b}", sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b]))
             )
             clipped = program.assign(f"Q_CLIPPED_{a}_{b}", clip(remaining[a, b], -largest, largest))
             entries[a, b] = (

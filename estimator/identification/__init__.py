@@ -15,11 +15,7 @@ from estimator.identification.data.record import Record
 from estimator.identification.data.record_reader import read_records
 from estimator.identification.diagnostics.validity_checks import run_all_checks
 from estimator.identification.fitting.multistart_search import search_coefficients, spread_along_ridge
-from estimator.identification.fitting.posterior_belief import (
-    contraction_history,
-    one_step_forecasts,
-    posterior_belief,
-)
+from estimator.identification.fitting.posterior_belief import contraction_history, one_step_forecasts, posterior_belief
 from estimator.identification.identification_result import Result, parameter_moments
 from estimator.identification.likelihood.problem_signals import mask_unexplained_outputs
 from estimator.identification.likelihood.scaled_records import MAX_UNSTATED_DELAY, TARGET_PARAMETERS, ScaledRecords

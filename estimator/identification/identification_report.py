@@ -10,12 +10,7 @@ from pathlib import Path
 from estimator.identification.data.record import Record
 from estimator.identification.diagnostics.check_finding import CheckFinding
 from estimator.identification.fitting.posterior_belief import ContractionHistory
-from estimator.identification.report_figures import (
-    MAX_SHOWN_SAMPLES,
-    draw_contraction,
-    draw_fit,
-    draw_residuals,
-)
+from estimator.identification.report_figures import MAX_SHOWN_SAMPLES, draw_contraction, draw_fit, draw_residuals
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 from estimator.rigs.units import format_interval

@@ -6,11 +6,7 @@ from dataclasses import dataclass
 
 from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR
 from estimator.rigs.units import MAGNITUDE_BOUNDS
-from estimator.support.argument_checks import (
-    check_choice,
-    check_number,
-    mask_control_codes,
-)
+from estimator.support.argument_checks import check_choice, check_number, mask_control_codes
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,7 @@ from estimator.models.model import Model
 from estimator.rigs.channel import Channel
 from estimator.rigs.rig_toml import rig_file_text
 from estimator.rigs.units import MAGNITUDE_BOUNDS, Scales, sensor_kind_of_unit
-from estimator.support.argument_checks import (
-    check_choice,
-    check_integer,
-    check_number,
-    did_you_mean,
-    short_repr,
-)
+from estimator.support.argument_checks import check_choice, check_integer, check_number, did_you_mean, short_repr
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
 #: Interpolations that allow a fractional delay.

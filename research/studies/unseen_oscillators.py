@@ -85,10 +85,7 @@ def oscillator_classes(rigs: Sequence[FamilyMember]) -> Iterator[tuple[str, npt.
     yield "all", np.ones(len(rigs), dtype=np.bool_)
     for kind in dict.fromkeys(stiffness_kinds):
         yield str(kind), stiffness_kinds == kind
-    for name, values, edge in (
-        ("damping", [m.damping for m in rigs], 0.025),
-        ("drive", [m.drive for m in rigs], 0.14),
-    ):
+    for name, values, edge in (("damping", [m.damping for m in rigs], 0.025), ("drive", [m.drive for m in rigs], 0.14)):
         yield f"weak {name}", np.array(values) < edge
         yield f"strong {name}", np.array(values) >= edge
     known = np.array([member.options.get("noise_range") == 1.0 for member in rigs])

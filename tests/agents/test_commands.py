@@ -149,10 +149,7 @@ def test_warnings_are_told(run, folder, monkeypatch):
         (["rig", "init", "new.toml", "--from", "bem"], "there is no bem"),
         (["rig", "init", "new.toml", "--from", "plain.csv"], "add --step SECONDS"),
         (["rig", "init", "new.toml", "--from", "fortnights.csv"], "the unit of the times must be one of s, ms"),
-        (
-            ["rig", "init", "new.toml", "--from", "r.mat"],
-            "r.mat must be a CSV file to have a step, but is a MAT file",
-        ),
+        (["rig", "init", "new.toml", "--from", "r.mat"], "r.mat must be a CSV file to have a step, but is a MAT file"),
         (["rig", "init", "new.toml", "--from", "r.mat", "--step", "1"], "r.mat must be a sound MAT file"),
         (
             ["rig", "init", "new.toml", "--from", "kind.csv"],

@@ -235,8 +235,7 @@ def normalised(env):
 
 
 @table(
-    ("wrap", "name"),
-    [(normalised, "NormalizeObservation"), (Halved, "Halved"), (Three, "Three"), (Stacked, "Stacked")],
+    ("wrap", "name"), [(normalised, "NormalizeObservation"), (Halved, "Halved"), (Three, "Three"), (Stacked, "Stacked")]
 )
 def test_a_wrapper_of_gymnasium_that_would_not_be_played_is_refused(tmp_path, wrap, name):
     model = PPO("MlpPolicy", wrap(gym.make("duffing_env/Short-v0")), device="cpu")

@@ -124,10 +124,7 @@ BAD = [
     ({"observation": lambda beliefs: beliefs.mean[0]}, "observation must give finite numbers of shape (n, entries)"),
     ({"observation": lambda beliefs: np.zeros((len(beliefs.mean), 0))}, "finite numbers of shape (n, entries)"),
     ({"history": 0}, "history must be a whole number from 1"),
-    (
-        {"reward": gain, "terminal": True},
-        "terminal and terminated_return must be left out where reward is a function",
-    ),
+    ({"reward": gain, "terminal": True}, "terminal and terminated_return must be left out where reward is a function"),
     ({"mean": {"k": 1.0}}, "mean must give some of the parameters ['m', 'c', 'a', 'b'], but is"),
     ({"mean": {"m": -1.0}}, "mean['m'] must be a number from"),
     ({"prior": 3}, "prior must be an estimator.Belief or None, but is 3"),

@@ -7,11 +7,7 @@ from reference.plants import CASES
 from tables import table
 
 from estimator import SILVERBOX_TWIN, OnlineEstimator, difference, silverbox_prior
-from estimator.inference.fisher_information import (
-    cramer_rao,
-    fisher_information,
-    relative_covariance,
-)
+from estimator.inference.fisher_information import cramer_rao, fisher_information, relative_covariance
 from estimator.inference.record_filter import inputs_by_sample, record_likelihoods
 from estimator.rigs.physical_parameters import coefficients_of
 

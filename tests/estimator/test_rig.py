@@ -77,10 +77,7 @@ def test_a_saved_rig_is_the_same(rig, tmp_path):
         ({"interpolation": []}, "interpolation must be one of"),
         ({"interpolation": "cubic"}, "interpolation must be one of"),
         ({"delay": -1.5}, "delay (for zero_order) must be"),
-        (
-            {"delay": 0.5, "interpolation": "look_ahead"},
-            "interpolation (for a fractional delay) must be one of",
-        ),
+        ({"delay": 0.5, "interpolation": "look_ahead"}, "interpolation (for a fractional delay) must be one of"),
         ({"input": {"unit": "N", "range": 3.0}}, "input must have no range, but has 3.0; use limit"),
         ({"output": {"unit": "m", "limit": 3.0}}, "output must have no limit, but has 3.0; use range"),
         ({"input": {"unit": "N", "kind": "velocity"}}, "input must have no kind"),

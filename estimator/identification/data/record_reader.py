@@ -11,10 +11,7 @@ import numpy as np
 
 from estimator.identification.data.duplicate_samples import find_shared_samples
 from estimator.identification.data.record import Record
-from estimator.identification.data.record_cleaning import (
-    MIN_PIECE_OUTPUTS,
-    split_at_missing_inputs,
-)
+from estimator.identification.data.record_cleaning import MIN_PIECE_OUTPUTS, split_at_missing_inputs
 from estimator.identification.data.record_files import read_record_file
 from estimator.rigs.rig import Rig
 from estimator.rigs.units import MAGNITUDE_BOUNDS

@@ -12,11 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from estimator.identification.data.column_units import is_unit
-from estimator.identification.data.text_fields import (
-    DECIMAL_COMMA_SEPARATORS,
-    parse_number,
-    parse_timestamp,
-)
+from estimator.identification.data.text_fields import DECIMAL_COMMA_SEPARATORS, parse_number, parse_timestamp
 from estimator.support.array_types import FloatArray
 
 #: A number, or the whole seconds and their fraction of a timestamp.

@@ -11,14 +11,8 @@ import numpy as np
 from estimator.identification.fitting.noise_ratio_fit import fit_noise_ratio
 from estimator.identification.fitting.profile_likelihood import profile_posterior
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.fitting.starting_points import (
-    fit_first_starts,
-    fit_random_starts,
-)
-from estimator.identification.likelihood.fit_hypothesis import (
-    CoefficientPrior,
-    LaplaceFits,
-)
+from estimator.identification.fitting.starting_points import fit_first_starts, fit_random_starts
+from estimator.identification.likelihood.fit_hypothesis import CoefficientPrior, LaplaceFits
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.identification.likelihood.scaled_records import ScaledRecords

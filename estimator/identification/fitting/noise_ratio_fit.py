@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.likelihood.fit_hypothesis import (
-    FitHypothesis,
-    with_noise_ratios,
-)
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis, with_noise_ratios
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.inference.noise_grid import neg_log_half_cauchy
 from estimator.support.array_types import FloatArray

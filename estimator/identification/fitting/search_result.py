@@ -8,10 +8,7 @@ import numpy as np
 
 from estimator.identification.fitting.ridge_posterior import RidgePosterior
 from estimator.identification.fitting.weak_form import input_effect_rms
-from estimator.identification.likelihood.fit_hypothesis import (
-    FitHypothesis,
-    LaplaceFits,
-)
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis, LaplaceFits
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.support.array_types import FloatArray
 

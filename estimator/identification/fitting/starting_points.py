@@ -7,11 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.identification.fitting.weak_form import random_starts, weak_form_starts
-from estimator.identification.likelihood.fit_hypothesis import (
-    FitHypothesis,
-    LaplaceFits,
-    with_noise_ratios,
-)
+from estimator.identification.likelihood.fit_hypothesis import FitHypothesis, LaplaceFits, with_noise_ratios
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
 from estimator.rigs.physical_parameters import coefficients_of

@@ -25,11 +25,7 @@ from estimator.identification.likelihood.batch_linear_algebra import (
     solve_batch,
     solve_with_fixed_directions,
 )
-from estimator.identification.likelihood.fit_hypothesis import (
-    CoefficientPrior,
-    FitHypothesis,
-    LaplaceFits,
-)
+from estimator.identification.likelihood.fit_hypothesis import CoefficientPrior, FitHypothesis, LaplaceFits
 from estimator.identification.likelihood.scaled_records import FilterSamples, ScaledRecords
 from estimator.inference.record_filter import RecordLikelihoods, record_likelihoods
 from estimator.support.array_types import FloatArray

@@ -95,10 +95,7 @@ def test_sigma_points_mend_a_wide_prior():
 
 @pytest.mark.parametrize(
     "case",
-    [
-        Case(2e-3, 1e-3, 256, SAME, hypotheses=HYPOTHESES),
-        Case(*SAME, 256, (1.5e-3, 1.5e-3), hypotheses=HYPOTHESES),
-    ],
+    [Case(2e-3, 1e-3, 256, SAME, hypotheses=HYPOTHESES), Case(*SAME, 256, (1.5e-3, 1.5e-3), hypotheses=HYPOTHESES)],
     ids=["noise priors too small", "noise priors too large"],
 )
 def test_an_ensemble_mends_wrong_noise_priors(case):
