@@ -146,7 +146,7 @@ def test_a_circle_is_found_wherever_the_import_stands(text, tmp_path):
         ("uninstalled", "agents/a.py", "research.b"),
         ("uninstalled", "evaluate.py", "research.b"),
         ("policy_in_planning", "agents/planning/a.py", "agents.policies"),
-        ("policy_in_planning", "agents/planning/a.py", "agents.predict_checks"),
+        ("policy_in_planning", "agents/planning/a.py", "agents.predict_argument_checks"),
         ("commands_below", "agents/training/a.py", "agents.cli"),
         ("commands_below", "agents/policies/a.py", "agents.commands.b"),
     ],

@@ -45,7 +45,7 @@ class RunSettings:
             self._check()
 
     def _check(self) -> None:
-        from agents.predict_checks import MAX_SAMPLES
+        from agents.predict_argument_checks import MAX_SAMPLES
         from estimator.support.argument_checks import (
             MAX_SEED,
             MIN_MAGNITUDE,

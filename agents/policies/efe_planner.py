@@ -52,7 +52,7 @@ from agents.planning.model_probe import ModelView, is_on_rig, observation_layout
 from agents.planning.plan_objective import DEFAULT_RISK, PlanObjective, margin_profile
 from agents.planning.receding_horizon import PlanArrays, PlanSettings, compile_receding_horizon
 from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales, recoverable_step
-from agents.predict_checks import check_batch_size, check_last_observation, episode_starts
+from agents.predict_argument_checks import check_batch_size, check_last_observation, episode_starts
 from estimator.engine.noise_free_step import with_coarse_substeps
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
 from estimator.support.array_types import FloatArray

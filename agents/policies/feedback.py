@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents.planning.model_probe import observation_layout, probe_dynamics, resonance_frequencies
 from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
-from agents.predict_checks import check_batch_size, check_state, episode_starts
+from agents.predict_argument_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import to_float_array

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from agents.policies.networks.feature_encoder import FeatureEncoder
 from agents.policies.networks.feature_names import FEATURE_NAMES
-from agents.predict_checks import check_observation_finite, check_observation_size
+from agents.predict_argument_checks import check_observation_finite, check_observation_size
 from estimator.support.argument_checks import to_float_array
 
 _VELOCITY = FEATURE_NAMES.index("velocity")

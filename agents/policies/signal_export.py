@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agents.policies.excitations import EXCITATIONS
 from agents.policies.feedback import FEEDBACK
 from agents.policies.signals import DEFAULT_MAX_INPUT, DEFAULT_SAMPLES, InputLimits
-from agents.predict_checks import MAX_SAMPLES
+from agents.predict_argument_checks import MAX_SAMPLES
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import MAX_SEED, check_integer, did_you_mean, short_repr
 from estimator.support.file_io import write_atomically

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.planning.model_probe import believed_resonance
 from agents.policies.excitations import EXCITATIONS, SignalDraw, draw_recorded
-from agents.predict_checks import MAX_SAMPLES, check_batch_size, check_state, episode_starts
+from agents.predict_argument_checks import MAX_SAMPLES, check_batch_size, check_state, episode_starts
 from estimator.belief import Belief
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import (

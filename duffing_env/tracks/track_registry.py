@@ -57,10 +57,12 @@ def _model_track(system: str, **kwargs: Any) -> dict[str, Any]:
 #: ``max_episode_steps``: its time limit would truncate a longer ``horizon`` (`duffing_env.env_common.ExperimentEnv`).
 TRACKS: dict[str, dict[str, Any]] = {
     "duffing_env/Amplitude-v0": _difference_track("env:DuffingEnv"),
-    "duffing_env/Short-v0": _difference_track("tracks.limited_tracks:ShortEnv", horizon=48),
-    "duffing_env/Power-v0": _difference_track("tracks.limited_tracks:PowerEnv", max_rms=0.0222),
-    "duffing_env/Output-v0": _difference_track("tracks.limited_tracks:OutputEnv", max_output=0.3),
-    "duffing_env/Drift-v0": _difference_track("tracks.limited_tracks:DriftEnv", horizon=512, jump=0.3, drift=0.01),
+    "duffing_env/Short-v0": _difference_track("tracks.difference_equation_tracks:ShortEnv", horizon=48),
+    "duffing_env/Power-v0": _difference_track("tracks.difference_equation_tracks:PowerEnv", max_rms=0.0222),
+    "duffing_env/Output-v0": _difference_track("tracks.difference_equation_tracks:OutputEnv", max_output=0.3),
+    "duffing_env/Drift-v0": _difference_track(
+        "tracks.difference_equation_tracks:DriftEnv", horizon=512, jump=0.3, drift=0.01
+    ),
     "duffing_env/Amplitude-v1": _continuous_track("ContinuousEnv"),
     "duffing_env/Short-v1": _continuous_track("ContinuousShortEnv", horizon=48),
     "duffing_env/Power-v1": _continuous_track("ContinuousPowerEnv", max_rms=0.0222),

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from agents.predict_checks import check_state, episode_starts
+from agents.predict_argument_checks import check_state, episode_starts
 
 FloatArray = npt.NDArray[np.float32]
 LstmState = tuple[FloatArray, FloatArray]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from agents.policies.networks.compiled_decision import CompiledActor, compile_decision
 from agents.policies.networks.feature_encoder import FeatureEncoder
 from agents.policies.networks.lstm import FloatArray, Lstm, checked_tensor
-from agents.predict_checks import check_observation_finite, check_observation_size
+from agents.predict_argument_checks import check_observation_finite, check_observation_size
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_integer, check_number, to_float_array
 from estimator.support.file_io import check_readable_file

@@ -12,7 +12,7 @@ from agents.sb3_vec_env import DuffingVecEnv
 from agents.track_ids import RIG_TRACK
 from agents.training.environments import oscillator_family
 from agents.training.environments.feature_vec_env import FeatureVecEnv
-from agents.training.environments.mixed_vec_env import DrawOptions, MixedVecEnv, TrackOptions, draw_track_options
+from agents.training.environments.randomised_vec_env import DrawOptions, MixedVecEnv, TrackOptions, draw_track_options
 from agents.training.training_config import INFORMATION_REWARDS, TrainConfig
 
 #: Environments in which random actions are played to fit the normaliser of the features.

@@ -40,7 +40,7 @@ def draw_track_options(
 
     Example:
         >>> import numpy as np
-        >>> from agents.training.environments.mixed_vec_env import draw_track_options
+        >>> from agents.training.environments.randomised_vec_env import draw_track_options
         >>> drawn = draw_track_options(np.random.default_rng(1), "duffing_env/Power-v0", {}, {"horizon": (128, 1024)})
         >>> drawn
         TrackOptions(env_id='duffing_env/Power-v0', options={'horizon': 371})

@@ -8,7 +8,7 @@ from tables import table
 
 from agents.training import PPOSettings, TrainConfig, resume, train
 from agents.training.environments.feature_vec_env import REWARD_SCALE
-from agents.training.environments.mixed_vec_env import MixedVecEnv, draw_track_options
+from agents.training.environments.randomised_vec_env import MixedVecEnv, draw_track_options
 from agents.training.environments.training_envs import draw_family_options
 from estimator.compilation.simd import LANES
 
