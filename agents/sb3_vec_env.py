@@ -86,7 +86,7 @@ class DuffingVecEnv(BatchVecEnv):
     Args:
         env: the id of a registered track; or a vector environment that was made with
             ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
-        num_envs: number of rows; that of ``env`` where it was made.
+        num_envs: number of rows; of a given vector environment, its own.
         seed: of the batch; the next reset uses it.
         levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by index; 0: any input between.
         options: of the environment, and ``threads``.

@@ -56,7 +56,7 @@ def load_object(name_in_module: str, role: str) -> Any:
 
 @contextmanager
 def attribute_user_errors(name_in_module: Any, role: str) -> Iterator[None]:
-    """Let what a thing of a user's own raises say whose it is, and where: it may be no policy at all.
+    """Let an exception of user code name the object and the place: it may be no policy at all.
 
     Args:
         name_in_module: ``module:name``; of what has another name, faults are the program's.

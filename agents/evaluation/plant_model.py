@@ -21,8 +21,8 @@ class PlantModel(NamedTuple):
         model: its equation.
         interpolation: of the input between samples.
         prior: of its coefficients.
-        process_noise: standard deviation, or that of each system (n,).
-        sensor_noises: standard deviations, one for each sensor (p,), or those of each system (n, p).
+        process_noise: standard deviation, of all systems or of each (n,).
+        sensor_noises: standard deviations, one for each sensor (p,), or for each system and sensor (n, p).
     """
 
     model: Model

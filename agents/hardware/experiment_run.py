@@ -155,7 +155,7 @@ class _PreparedRun:
 
 @dataclass
 class _Ending:
-    """How the played part of a run ended; the fields are those of `RunResult`."""
+    """How the played part of a run ended, with the fields of `RunResult`."""
 
     outcome: str = ""
     message: str = ""

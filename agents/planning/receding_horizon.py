@@ -286,7 +286,7 @@ def compile_receding_horizon(model: Model, degree: int = 0, lag: int = 0) -> Rec
 
 @jit
 def beam_widths(cells, has_hard_margin):
-    """Beams on a grid of so many cells along an axis, and beams far ahead: whole blocks.
+    """Beams for a grid with this number of cells along an axis, near and far ahead: whole blocks.
 
     Example:
         >>> [beam_widths(cells, False) for cells in (22, 25, 35, 38)], beam_widths(25, True)

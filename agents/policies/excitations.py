@@ -193,7 +193,7 @@ def _square(rng: np.random.Generator, samples: int, max_input: float, step: floa
 def linear_resonance(theta1: FloatArray | np.float64, theta3: FloatArray | np.float64) -> FloatArray:
     """Frequency at which the linear part of Eq. (2) rings [Hz], within `BAND`.
 
-    The poles are those of z² - θ1 z - θ3, of the angle arccos(θ1 / (2 sqrt(-θ3))). It is 68.1 Hz for the twin;
+    The poles are the roots of z² - θ1 z - θ3, with the angle arccos(θ1 / (2 sqrt(-θ3))). It is 68.1 Hz for the twin;
     sqrt(a / m) / 2π, without damping and samples, is 67.9 Hz. Where θ3 is not negative, no oscillator is described, and
     the lower edge is given. Both are of one shape, whatever it is.
     """

@@ -153,7 +153,7 @@ def _write_files(folder: Path, network: NetworkCard, tensors: dict[str, Any], ca
         written_here = {
             "format": CARD_FORMAT,
             "network": asdict(network),
-        }  # also where the card is that of another policy
+        }  # also where the card belongs to another policy
         write_atomically(half_written / CARD_FILE, json.dumps({**written_here, **card, **written_here}, indent=2))
         # Weights without a card are no policy, so none is ever read with the card of another.
         (folder / CARD_FILE).unlink(missing_ok=True)

@@ -145,7 +145,7 @@ class TrainedPolicy:
         self._rng = np.random.default_rng(seed)
 
     def adapt_to(self, env: Any) -> None:
-        """Play this unwrapped environment, with its prior, limits and noises, instead of that of the training.
+        """Play this unwrapped environment, with its prior, limits and noises, in place of the training's.
 
         Raises:
             ValueError: for an environment with another observation than the card of the policy names. With features:
@@ -165,7 +165,7 @@ class TrainedPolicy:
             )
 
     def _check_encoder(self, encoder: FeatureEncoder) -> FeatureEncoder:
-        """The encoder, if its features are those of the network."""
+        """The encoder, if the network takes its features."""
         model = self._description.get("model")
         if encoder.size != self._n_inputs or (
             encoder.with_observation and model is not None and encoder.model_view.model != Model(**model)
