@@ -118,7 +118,7 @@ class OnlineEstimator:
             rig = Rig(prior.step, *(("linear", 0) if self.model.is_continuous else ("zero_order", 1)), *units)
         if rig.step != prior.step:
             raise ValueError(
-                f"rig.step must be that of the prior, {prior.step}, but is {rig.step}; make the prior with "
+                f"rig.step must be the prior's, {prior.step}, but is {rig.step}; make the prior with "
                 "scales=rig.scales, or give the rig the prior's step"
             )
         self.rig, self.scales = rig, prior.scales

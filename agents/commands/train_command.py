@@ -48,7 +48,7 @@ class TrainCommand(TrainConfig):
     seeds: int = 1
     """Trainings, of the seed and those after it, into OUTPUT/SEED each; the same command goes on with them."""
     ray: bool = False
-    """Whether seeds, or trials of --tune, are spread over a Ray cluster: that of RAY_ADDRESS, or of this machine."""
+    """Whether seeds, or trials of --tune, are spread over a Ray cluster: at RAY_ADDRESS, or of this machine."""
     systems: int = 32
     """Systems to compare on afterwards; 0 to skip the comparison."""
 

@@ -86,7 +86,7 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             it: it gives the amplitude limit, the episode's length and, where it replays a record, the recorded
             input. Planners read its belief and model, do not play without it, and refuse observations
             that it did not show last. None: a Duffing track with a limit of 0.15 V.
-        seed: The seed of the policy's own randomness; of a trained policy, that of the actions it samples.
+        seed: The seed of the policy's own randomness; of a trained policy, the seed of its sampled actions.
         options: Further options of a policy that has some, such as `horizon=8` of `"efe"`; a
             trained policy has none.
 

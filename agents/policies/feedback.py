@@ -130,7 +130,7 @@ class FeedbackPolicy:
         size = self._layout.size
         if observed.ndim not in (1, 2) or observed.shape[-1] != size:
             raise ValueError(
-                f"observation must have the shape ({size},) or (environments, {size}), as those of duffing_env have, "
+                f"observation must have the shape ({size},) or (environments, {size}), as duffing_env gives it, "
                 f"but its shape is {observed.shape}; a policy with feedback needs them as they are"
             )
         return np.atleast_2d(observed)

@@ -29,7 +29,7 @@ class Call:
         what: is called, for the table of faults.
         function: does it.
         names: of the arguments, one of which a clear message has.
-        state: gives what a failed call must not change.
+        state: gives the part that a failed call must not change.
         sound: whether a result is one; says what is wrong with it, or nothing.
         given: arguments, to show with a fault.
     """

@@ -9,7 +9,7 @@ first velocity, which the belief takes to be uncertain by 0.02 rad/s. Gains are 
 Left out of the publication is only a noise of 0.1 mrad of the angle, there to make a matrix regular; and where the
 angle goes beyond 4 rad the episode ends, which the table counts.
 
-The published figures are those of the repository Sahel13/InsideOutSMC.jl, experiments/pendulum/linear: the set-up
+The published figures are from the repository Sahel13/InsideOutSMC.jl, experiments/pendulum/linear: the set-up
 stands in environment.jl, the evaluation in online_inference/make_plot.jl, the gains in the data's files
 linear_pendulum_info_gain_*.csv. Their last row says 50, but of 50 samples every fifth from the first on is taken, so
 that it is sample 46. The learned policies there were trained with a price of 0.1 on changes of the input.

@@ -40,7 +40,7 @@ class WaitThenPlan:
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The actions, as `agents.policies.Policy`; the state is that of the planner."""
+        """The actions, as `agents.policies.Policy`; the state is the planner's."""
         waits = (1.0 - np.asarray(observation)[..., self._time_left, None]) * self._horizon < WAIT_SAMPLES - 0.5
         if waits.all():
             return waits.astype(np.float32), None

@@ -388,7 +388,7 @@ def test_unchanged_after_a_run_that_raised(samples, change, message):
         (lambda: OnlineEstimator("duffing"), "model must be a Model, but is 'duffing'; use difference() or duffing()"),
         (lambda: OnlineEstimator(PENDULUM), "prior must be given for pendulum"),
         (lambda: OnlineEstimator(ODE, silverbox_prior()), "prior must be a Belief of duffing ('stiff"),
-        (lambda: OnlineEstimator(rig=Rig(step=1.0)), "rig.step must be that of the prior, 0.0016384, but is 1.0"),
+        (lambda: OnlineEstimator(rig=Rig(step=1.0)), "rig.step must be the prior's, 0.0016384, but is 1.0"),
         (lambda: OnlineEstimator(rig=3), "rig must be a Rig, a dictionary or a file name, but is 3"),
         (
             lambda: OnlineEstimator(factorisation="bethe"),
