@@ -42,7 +42,7 @@ def plant_mover() -> Any:
     draw_noise, plant, u = (
         compile_noise_draw(_PLACE),
         generated_functions(_EXPERIMENT.kernel_spec).step_plant,
-        _PLACE["U_0"] * LANES,
+        _PLACE["U_u_0"] * LANES,
     )
 
     @kernel(variant=_EXPERIMENT.kernel_spec.name)
@@ -67,7 +67,7 @@ def updater(factorisation: str, iterations: int) -> Any:
     else:
         place = mean_field.mean_field_layout()
         update = mean_field.compile_mean_field_update(place)
-    u, y = place["U_0"] * LANES, place["Y_y"] * LANES
+    u, y = place["U_u_0"] * LANES, place["Y_y"] * LANES
 
     @kernel(variant=f"{model.digest}_{factorisation}_{iterations}")
     def infer_all(blocks, inputs, outputs):

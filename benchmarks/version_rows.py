@@ -58,7 +58,8 @@ def update_of(equation: str) -> tuple[Any, list[int], int, int]:
             from estimator.engine.tasks import structured as compile_belief_update
 
         task = compile_belief_update(duffing() if continuous else difference(), int(continuous))
-        inputs = [task.layout[name] for name in ("U_0", "U_1")[: 1 + continuous]]
+        prefix = "U_u" if "U_u_0" in task.layout else "U"  # the latter in an older version
+        inputs = [task.layout[f"{prefix}_{k}"] for k in range(1 + continuous)]
         return task.update, inputs, task.layout["Y_y"], len(task.layout)
 
     from estimator.record import LAYOUT, N_ROWS

@@ -310,7 +310,7 @@ def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArr
 def _recorded_difference(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
     twin = coefficients_of(difference(), SILVERBOX_TWIN)
     centers = dict(zip(("x1", "x1**3", "x2"), twin[:3], strict=True))
-    centers["u" if model.taps == 1 else "u1"] = twin[3]
+    centers["u" if model.taps["u"] == 1 else "u1"] = twin[3]
     terms = [part.split("*", 1)[1] for part in model.next_state[0].split(" + ")]
     stds = {"V": 0.1 * spread, "1": spread}
     std = [stds.get(unit, 1 + spread) for unit in model.coefficients.values()]

@@ -25,7 +25,7 @@ import numpy as np
 from estimator.compilation.array_operations import copy_scaled, fill
 from estimator.compilation.simd import jit, jit_closure, kernel
 from estimator.engine.information_gradient import compile_adjoint
-from estimator.engine.input_hold import n_older_inputs
+from estimator.engine.storage_layout import n_older_inputs
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -111,7 +111,7 @@ def compile_d_optimality(model: Model, degree: int = 0) -> DOptimality:
         path_functions.n_path,
         path_functions.n_tape,
     )
-    k, n_older = model.n_coefficients, n_older_inputs(model, degree)
+    k, n_older = model.n_coefficients, max(n_older_inputs(model, degree).values())
     compile_key = f"{model.name}_{model.digest}_{degree}"
 
     @jit_closure(compile_key)

@@ -16,6 +16,7 @@ from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel
 from estimator.engine.noise_free_step import compile_noise_free_step
+from estimator.engine.storage_layout import input_history_row
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -118,7 +119,8 @@ def _compile_local_dynamics(model: Model) -> Any:
         free_response.linearise,
         free_response.regressors,
     )
-    n, k, size, u = model.n_states, model.n_coefficients, len(at), at["INPUT"]
+    n, k, size = model.n_states, model.n_coefficients, len(at)
+    u = at[input_history_row(next(iter(model.inputs)), 0)]
     now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
     state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
     linear, first = at[f"A_{state}_{state}"], at[f"REGRESSOR_{coefficient}"]

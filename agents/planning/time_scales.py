@@ -15,6 +15,7 @@ from agents.planning.model_probe import ModelView, is_on_rig
 from estimator.compilation.array_operations import copy, fill
 from estimator.compilation.simd import kernel
 from estimator.engine.noise_free_step import compile_noise_free_step
+from estimator.engine.storage_layout import input_history_row
 from estimator.support.array_types import FloatArray
 
 #: Samples of the motion by which a system is measured.
@@ -70,7 +71,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
         free_response.step,
     )
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
-    u, shown, velocity = at["INPUT"], at["Y_PRED"], at["VELOCITY"]
+    u, shown, velocity = at[input_history_row(next(iter(view.model.inputs)), 0)], at["Y_PRED"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
     # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)

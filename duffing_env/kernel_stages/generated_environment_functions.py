@@ -86,6 +86,7 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
     The step of a difference equation includes its first sensor.
     """
     from estimator.engine import symbolic
+    from estimator.engine.inputs_at_end import inputs_at_end
 
     names = {**{x: f"X_{x}" for x in model.states}, **{c: f"TRUE_{c}" for c in model.coefficients}}
     lines, results = symbolic.propagate_state(model, degree, names)
@@ -108,12 +109,12 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
         after[x] = symbol(f"K_{x}")
     results = {names[x]: f"K_{x}" for x in model.states}
-    end = symbolic.input_at_end(model, degree)
+    at_end = {str(name): value for name, value in inputs_at_end(model, degree).items()}
     source = ""
     for k, (y, output_expression) in enumerate(zip(model.outputs, derivatives.outputs, strict=True)):
         noise = (v, w)[k % 2] * symbol(noises[1 + k])
         state_rows = names if model.is_continuous or k else {**names, **after}
-        value = symbolic.substitute([("", output_expression)], {**state_rows, "u": end})[0][1] + noise
+        value = symbolic.substitute([("", output_expression)], {**state_rows, **at_end})[0][1] + noise
         if model.is_continuous or k:
             source += loop(f"measure_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
         else:

@@ -63,7 +63,7 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     source_text += loop(
         "step_true", "The true plant moves.", *propagate_state(model, spec.degree, true), *substep_arguments
     )
-    output_expression = differentiate(model).outputs[0].subs(symbol("u"), 0)
+    output_expression = differentiate(model).outputs[0].subs({symbol(name): 0 for name in model.input_ages})
     believed_output, true_output = (substitute([("", output_expression)], names)[0][1] for names in (believed, true))
     lines = [
         ("E_d", symbol("SUM_SQUARED_DIFFERENCE") + (believed_output - true_output) ** 2),
@@ -112,7 +112,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
             input_before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
             input_before_last = max_input * TEST_INPUT[t - 2] if t > 1 else 0.0
             for j in range(LANES):
-                feed_input(W, j, input_now, input_before, input_before_last)
+                feed_input(W, j, 0, input_now, input_before, input_before_last)
             if is_continuous:
                 for s in range(substeps):
                     step_believed(W, s / substeps)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.compilation.simd import LANES, jit_closure, number_rows
-from estimator.engine.storage_layout import belief_rows, integrator_rows, trace_rows, update_layout
+from estimator.engine.storage_layout import belief_rows, integrator_rows, known_inputs, trace_rows, update_layout
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 
@@ -277,13 +277,12 @@ def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
 
 
 def model_input_rows(spec: KernelSpec, model: Model, row_of: Mapping[str, int]) -> dict[str, int]:
-    """Rows of a model's input over a sample, ``U_0``, ``U_1``, ...: other names of rows that a block has anyway."""
-    if model.is_continuous:
-        names = ["INPUT"] if spec.degree == 0 else ["LAST_INPUT", "RISE"]
-    elif spec.truth_model.is_continuous and spec.degree == 1:
-        # A difference equation takes the input at the sample before: the last action, where the input goes linearly
-        # from one action to the next.
-        names = ["LAST_INPUT", "OLDER_INPUT"]
-    else:
-        names = ["INPUT", "LAST_INPUT", "OLDER_INPUT"]
-    return {f"U_{k}": row_of[name] for k, name in enumerate(names)}
+    """Rows of a model's inputs over a sample: other names of rows that a block has anyway."""
+    # A difference equation takes the input at the sample before: the last action, where the input goes linearly from
+    # one action to the next.
+    lag = int(not model.is_continuous and spec.truth_model.is_continuous and spec.degree == 1)
+    rows = ("INPUT", "LAST_INPUT", "OLDER_INPUT")
+    return {
+        row.name: row_of["RISE" if row.subtracted_age is not None else rows[row.age]]
+        for row in known_inputs(model, spec.degree, lag)
+    }

@@ -20,7 +20,7 @@ from __future__ import annotations
 import sympy as sp
 
 from estimator.engine import symbolic
-from estimator.engine.storage_layout import cubature_order
+from estimator.engine.storage_layout import cubature_order, input_row
 from estimator.engine.symbolic import (
     HALF,
     ONE,
@@ -107,7 +107,7 @@ def propagate_point_difference(model: Model) -> tuple[Assignments, dict[str, str
     """A sample of a difference equation, from the point at ``SIGN`` times ``L_C`` from the mean to ``IMAGE_P``."""
     lines, _ = place_point(model)
     named = {f"NEXT_{i}": move for i, move in zip(model.states, differentiate(model).moves, strict=True)}
-    inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
+    inputs = {written: input_row(*tap) for written, tap in model.input_ages.items()}
     lines += substitute(named.items(), inputs | {i: f"{to}_e" for i, to in point_names(model).items()})
     return lines, {f"IMAGE_P_{i}": f"NEXT_{i}" for i in model.states}
 

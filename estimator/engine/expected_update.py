@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 from estimator.compilation.simd import LANES, number_rows
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
-from estimator.engine.storage_layout import upper_triangle_names
+from estimator.engine.storage_layout import input_history_row, known_inputs, n_older_inputs, upper_triangle_names
 from estimator.models.model import Model
 
 #: Information [nats] of a belief that has diverged: finite, and below all others.
@@ -27,8 +26,8 @@ DIVERGED_SCORE = -1e300
 class ExpectedUpdate:
     """The predicted belief of a model, in SIMD lanes.
 
-    The newest input of a sample is in row ``INPUT``. Older inputs, if the model has them, are in ``LAST_INPUT`` and
-    ``OLDER_INPUT``; ``advance`` shifts them.
+    The newest value of an input is in row ``INPUT_<input>``. Older ones, if the model has them, are in
+    ``LAST_INPUT_<input>`` and ``OLDER_INPUT_<input>``; ``advance`` shifts them.
 
     Attributes:
         advance: ``advance(W, record, walk)``: one sample without data in every lane. ``record`` is the flat record of a
@@ -92,19 +91,27 @@ def compile_expected_update(model: Model, degree: int = 0, lag: int = 0) -> Expe
 
 
 def input_history_rows(model: Model, degree: int, lag: int) -> list[str]:
-    """Rows of the inputs of a sample, newest first."""
-    older = degree if model.is_continuous else min(2, model.taps - 1 + lag)
-    return ["INPUT", "LAST_INPUT", "OLDER_INPUT"][: older + 1]
+    """Rows of the inputs of a sample, one input after the other, each newest first."""
+    return [input_history_row(i, age) for i, n in n_older_inputs(model, degree, lag).items() for age in range(n + 1)]
+
+
+def shifted_history(model: Model, degree: int, lag: int) -> dict[str, str]:
+    """Row of each older input to the row whose value it takes after the sample."""
+    older = n_older_inputs(model, degree, lag)
+    return {input_history_row(i, age + 1): input_history_row(i, age) for i, n in older.items() for age in range(n)}
 
 
 def input_coefficients_from_history(model: Model, degree: int, lag: int) -> dict[str, Any]:
-    """``U_k`` of the input over a sample, in symbols of `input_history_rows`."""
+    """Rows of `input_rows`, in symbols of `input_history_rows`."""
     from estimator.engine.symbolic import symbol
 
-    inputs = [symbol(name) for name in input_history_rows(model, degree, lag)]
-    if model.is_continuous:
-        return {"U_0": inputs[0]} if degree == 0 else {"U_0": inputs[1], "U_1": inputs[0] - inputs[1]}
-    return {f"U_{k}": inputs[min(k + lag, len(inputs) - 1)] for k in range(model.taps)}
+    inputs = list(model.inputs)
+    values = {}
+    for row in known_inputs(model, degree, lag):
+        values[row.name] = symbol(input_history_row(inputs[row.channel], row.age))
+        if row.subtracted_age is not None:
+            values[row.name] -= symbol(input_history_row(inputs[row.channel], row.subtracted_age))
+    return values
 
 
 def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapping[str, int]) -> str:
@@ -123,7 +130,7 @@ def _source(model: Model, degree: int, lag: int, inputs: list[str], layout: Mapp
     wider = [(walked[f"P_{c}_{c}"], symbol(f"P_{c}_{c}") + symbol(f"WALK_{c}")) for c in coefficients]
     lines = wider + symbolic.substitute([*lines, *more], {**walked, **input_values})
     results = {row: walked.get(value, value) for row, value in results.items()}
-    results = {**walked, **results, **{older: newer for newer, older in pairwise(inputs)}}
+    results = {**walked, **results, **shifted_history(model, degree, lag)}
     noises = ["PROCESS_VARIANCE", *(f"R_{y}" for y in model.outputs)]
     uniform = [*coefficients, *noises, *(f"WALK_{c}" for c in coefficients)]
     source = printer_numba.print_lane_loop(

@@ -24,6 +24,7 @@ from dataclasses import replace
 
 import sympy as sp
 
+from estimator.engine.inputs_at_end import inputs_at_end
 from estimator.engine.noise_iterations import iterate_noise_beliefs, sensor_free_energy
 from estimator.engine.printer_numba import is_numeral, print_expression
 from estimator.engine.psd_projection import project_to_psd
@@ -34,7 +35,6 @@ from estimator.engine.symbolic import (
     Program,
     Propagation,
     differentiate,
-    input_at_end,
     is_present,
     select,
     symbol,
@@ -102,9 +102,7 @@ class GaussianUpdate:
     def predicted_output(self, sensor: int, degree: int) -> tuple[sp.Expr, list[sp.Expr]]:
         """Predicted output of a sensor at the current mean, and its gradient h by all quantities."""
         c = differentiate(self.model)
-        at = {symbol(name): value for name, value in self.mean.items()} | {
-            symbol("u"): input_at_end(self.model, degree)
-        }
+        at = {symbol(name): value for name, value in self.mean.items()} | inputs_at_end(self.model, degree)
         return c.outputs[sensor].xreplace(at), [slope.xreplace(at) for slope in c.output_slopes[sensor]]
 
     def pending_output_variance(self, output_slope: Sequence[sp.Expr], sensor_variance: sp.Expr) -> sp.Expr:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 from estimator.compilation.simd import jit_closure
+from estimator.engine.storage_layout import known_inputs
 from estimator.models.interpolation import CAUSAL_INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_choice
@@ -26,39 +28,29 @@ def input_degree(model: Model, interpolation: str) -> int:
     return CAUSAL_INTERPOLATION_DEGREES[interpolation]
 
 
-def n_older_inputs(model: Model, degree: int) -> int:
-    """Number of inputs before the newest one in a sample's equation."""
-    return degree if model.is_continuous else model.taps - 1
-
-
 def compile_input_writer(model: Model, degree: int, input_rows: Sequence[int], lanes: int) -> Any:
-    """Compile ``feed(W, j, now, last, older)``, which writes a sample's inputs, newest first, into lane j of a block.
+    """Compile ``feed(W, j, i, now, last, older)``, which writes the values of input i, newest first, into a block.
 
     Args:
         model: the equation.
         degree: degree of the input's polynomial over a sample, 0 or 1.
-        input_rows: row numbers of ``U_0``, ``U_1``, ...
+        input_rows: row numbers of `estimator.engine.storage_layout.input_rows`.
         lanes: lanes of the block.
 
     Raises:
         ValueError: for another degree.
     """
-    if degree > 1:
-        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline needs the whole record")
-    rows = [place * lanes for place in input_rows]
-    first, second, third = [*rows, 0, 0][:3]
-    count, is_line = len(rows), model.is_continuous and degree == 1
+    rows = tuple(
+        (row.channel, place * lanes, row.age, -1 if row.subtracted_age is None else row.subtracted_age)
+        for row, place in zip(known_inputs(model, degree), input_rows, strict=True)
+    )
 
-    @jit_closure("_".join(map(str, (*rows, is_line, lanes))))
-    def feed(W, j, now, last, older):
-        if is_line:
-            W[first + j] = last
-            W[second + j] = now - last
-        else:
-            W[first + j] = now
-            if count > 1:
-                W[second + j] = last
-            if count > 2:
-                W[third + j] = older
+    @jit_closure("_".join(map(str, chain(*rows, (lanes,)))))
+    def feed(W, j, i, now, last, older):
+        values = (now, last, older)
+        for channel, place, age, subtracted_age in rows:
+            if channel == i:
+                value = values[age]
+                W[place + j] = value if subtracted_age < 0 else value - values[subtracted_age]
 
     return feed

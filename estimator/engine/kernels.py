@@ -46,7 +46,7 @@ class BeliefUpdate:
     """The belief update of a model.
 
     Attributes:
-        update: ``update(W)``: updates the belief of every lane by its rows ``U_k`` and ``Y_<sensor>``.
+        update: ``update(W)``: updates the belief of every lane by its rows ``U_<input>_<k>`` and ``Y_<sensor>``.
         layout: row number of each quantity.
         count_unsound: with sigma points, ``count_unsound(W)`` increments the row ``INDEFINITE_COUNT`` of lanes
             whose covariance is not positive semi-definite; ``update`` does so at its start.

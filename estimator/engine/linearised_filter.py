@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
+from estimator.engine.inputs_at_end import inputs_at_end
 from estimator.engine.printer_numba import print_expression
 from estimator.engine.psd_projection import project_to_psd
 from estimator.engine.storage_layout import likelihood_total_rows
@@ -14,7 +15,6 @@ from estimator.engine.symbolic import (
     Program,
     Propagation,
     differentiate,
-    input_at_end,
     positive_part,
     symbol,
     symmetric_entry,
@@ -65,7 +65,7 @@ def linearised_filter_step(
     totals = {name: symbol(name) for name in likelihood_total_rows(model)}
     for k, sensor in enumerate(model.outputs):
         tag = str(k)
-        at_mean = {symbol(i): value for i, value in mean.items()} | {symbol("u"): input_at_end(model, degree)}
+        at_mean = {symbol(i): value for i, value in mean.items()} | inputs_at_end(model, degree)
         predicted_output = assign(f"Y_PRED{tag}", found.outputs[k].xreplace(at_mean))
         h = [slope.xreplace(at_mean) for slope in found.output_slopes[k]]
         cross_cov = {i: assign(f"PH{tag}_{i}", sum((h[m] * at(i, states[m]) for m in range(n)), ZERO)) for i in states}

@@ -15,15 +15,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 from estimator.compilation.simd import number_rows
-from estimator.engine.expected_update import input_coefficients_from_history, input_history_rows
+from estimator.engine.expected_update import input_coefficients_from_history, shifted_history
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
-from estimator.engine.storage_layout import integrator_rows
-from estimator.models.model import Model
+from estimator.engine.storage_layout import input_history_row, integrator_rows
+from estimator.models.model import MAX_INPUT_AGE, Model
 
 #: Runge-Kutta steps per sample in gradient-based planning. A filter needs more, since its integration errors add up
 #: over a record; a plan compares inputs, all with the same error.
@@ -34,8 +33,8 @@ _COARSE_SUBSTEPS = 2
 class NoiseFreeStep:
     """The noise-free response of a model, for the systems of a block ``W`` (`estimator.compilation.simd`).
 
-    The input of a sample is in row ``INPUT``. Older inputs, if the model has them, are in ``LAST_INPUT`` and
-    ``OLDER_INPUT``; ``step`` shifts them.
+    The newest value of an input is in row ``INPUT_<input>``. Older ones, if the model has them, are in
+    ``LAST_INPUT_<input>`` and ``OLDER_INPUT_<input>``; ``step`` shifts them.
 
     Attributes:
         output_now: ``output_now(W)``: writes the first sensor's output without input into ``NOW``, with its
@@ -73,7 +72,14 @@ def compile_noise_free_step(model: Model, degree: int = 0, lag: int = 0, lanes: 
         lanes: lanes of a block.
     """
     coarse = with_coarse_substeps(model)
-    names = [*model.names, "INPUT", "LAST_INPUT", "OLDER_INPUT", "NOW", "VELOCITY", "GAIN", "Y_PRED"]
+    names = [
+        *model.names,
+        *(input_history_row(i, age) for i in model.inputs for age in range(MAX_INPUT_AGE + 1)),
+        "NOW",
+        "VELOCITY",
+        "GAIN",
+        "Y_PRED",
+    ]
     names += [f"{letter}_{c}" for letter in ("PHI", "REGRESSOR") for c in model.coefficients]
     names += [f"A_{i}_{j}" for i in model.states for j in model.states]
     layout = number_rows(*names, *integrator_rows(model))
@@ -107,14 +113,16 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     )
     source += variational_rk4.print_integrator(model, degree, layout, lanes, input_values=input_values)
     source += _step_source(model, degree, lag, loop)
-    constant_input = {symbol("u1"): symbol("u"), symbol("u2"): symbol("u")}
+    constant_input = {symbol(written): symbol(i) for written, (i, _) in model.input_ages.items()}
     summed = {
         f"SUM_{c}": sum(m.diff(symbol(c)) for m in derivatives.moves).xreplace(constant_input)
         for c in model.coefficients
     }
-    lines = symbolic.substitute(symbolic.eliminate_common_subexpressions(summed, "CSE"), {"u": "INPUT"})
+    lines = symbolic.substitute(
+        symbolic.eliminate_common_subexpressions(summed, "CSE"), {i: input_history_row(i, 0) for i in model.inputs}
+    )
     source += loop("regressors", "The regressors.", lines, {f"REGRESSOR_{c}": f"SUM_{c}" for c in model.coefficients})
-    rest = {symbol(name): 0 for name in (*model.states, "u", "u1", "u2")}
+    rest = {symbol(name): 0 for name in (*model.states, *model.input_ages)}
     slopes = {
         f"SLOPE_{i}_{j}": slope.subs(rest)
         for i, row in zip(model.states, derivatives.jacobian, strict=True)
@@ -122,7 +130,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     }
     results = {f"A_{name.removeprefix('SLOPE_')}": name for name in slopes}
     source += loop("linearise", "The linear part.", list(slopes.items()), results)
-    mirrored = {symbol(name): -symbol(name) for name in (*model.states, "u", "u1", "u2")}
+    mirrored = {symbol(name): -symbol(name) for name in (*model.states, *model.input_ages)}
     is_odd = all((e + e.xreplace(mirrored)).expand() == 0 for e in (*derivatives.moves, *derivatives.outputs))
     return source + f"IS_ODD = {is_odd}\n"
 
@@ -130,9 +138,9 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
 def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     """Source of ``output_after`` and ``step``."""
     from estimator.engine import printer_numba, symbolic
+    from estimator.engine.inputs_at_end import inputs_at_end
 
     derivatives, symbol, states = symbolic.differentiate(model), symbolic.symbol, list(model.states)
-    inputs = input_history_rows(model, degree, lag)
     source, (lines, propagation) = "", symbolic.propagate_sample(model)
     if model.is_continuous:
         point = {f"M_{x}": f"M_{x}_END" for x in states}
@@ -143,9 +151,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
             point,
             "TAU",
         )
-    at = dict(zip(map(symbol, states), propagation.state, strict=True)) | {
-        symbol("u"): symbolic.input_at_end(model, degree)
-    }
+    at = dict(zip(map(symbol, states), propagation.state, strict=True)) | inputs_at_end(model, degree)
     shown = derivatives.outputs[0].xreplace(at)
     output_slope = [slope.xreplace(at) for slope in derivatives.output_slopes[0]]
     n = len(states)
@@ -158,7 +164,7 @@ def _step_source(model: Model, degree: int, lag: int, loop: Any) -> str:
     more += [(f"END_{x}", value) for x, value in zip(states, propagation.state, strict=True)]
     results = {row: f"{row}_e" for row in ("Y_PRED", *(f"PHI_{c}" for c in model.coefficients))}
     results |= {x: f"END_{x}" for x in states}
-    results |= {older: newer for newer, older in pairwise(inputs)}
+    results |= shifted_history(model, degree, lag)
     source += loop("finish", "The output after the sample, and its derivatives.", [*lines, *more], results)
     for name, move, end in (("output_after", "move_state", "output"), ("step", "move", "finish")):
         source += printer_numba.print_sample(f"{name}(W)", model, f"{end}(W)", move)

@@ -28,7 +28,7 @@ class SharedUpdate:
         update: ``update(U, C)``: predicts every member, conditions it on the outputs, and writes its free energies.
         layout: rows of U: the belief, ``WEIGHT`` and ``FREE_ENERGY_<iteration>``; with ``every_iteration`` also the
             forecast, ``MEAN_<sensor>`` and ``VARIANCE_<sensor>``.
-        shared_layout: rows of C. Given are the mean of states and coefficients, ``U_k``, ``Y_<sensor>`` and the
+        shared_layout: rows of C. Given are the mean of states and coefficients, the inputs, ``Y_<sensor>`` and the
             shapes of the precisions; ``linearise`` writes the others.
     """
 

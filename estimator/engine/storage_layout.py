@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 from estimator.compilation.simd import number_rows
-from estimator.models.model import Model
+from estimator.models.model import MAX_INPUT_AGE, Model
 
 
 def upper_triangle_names(matrix: str, names: Iterable[str]) -> list[str]:
@@ -20,9 +21,86 @@ def belief_rows(model: Model) -> list[str]:
     return [*model.names, *upper_triangle_names("P", model.names), "GAMMA_SHAPE", "GAMMA_RATE", *sensors]
 
 
+def first_input_row(layout: Mapping[str, int], model: Model) -> int:
+    """Number of the first row of the inputs in a layout, which follow one another; 0 for a model without inputs."""
+    return min((layout[input_row(i, 0)] for i in model.inputs), default=0)
+
+
+class InputRow(NamedTuple):
+    """A row of the inputs over a sample: an input at one time, or its difference between two times.
+
+    Attributes:
+        name: name of the row.
+        channel: number of the input in the model's order.
+        age: age of the value in the row [samples]; 0 is the newest.
+        subtracted_age: age of the value that is subtracted; None for no difference.
+    """
+
+    name: str
+    channel: int
+    age: int
+    subtracted_age: int | None = None
+
+
+def input_row(name: str, k: int) -> str:
+    """The row of an input's tap k, or of its coefficient of τ^k over a sample."""
+    return f"U_{name}_{k}"
+
+
+def stage_input(name: str, tag: str) -> str:
+    """The name of an input's value at the stage ``A``, ``B`` or ``D`` of a Runge-Kutta step."""
+    return f"U_AT_{name}_{tag}"
+
+
+def input_history_row(name: str, age: int) -> str:
+    """The row of an input's value of an age, 0 to 2 samples, where a block keeps the last values themselves."""
+    return f"{('INPUT', 'LAST_INPUT', 'OLDER_INPUT')[age]}_{name}"
+
+
 def input_rows(model: Model, degree: int) -> list[str]:
-    """The input over a sample: taps of a difference equation, or coefficients of the polynomial in τ."""
-    return [f"U_{k}" for k in range(model.taps if not model.is_continuous else degree + 1)]
+    """The inputs over a sample, one after the other: taps of a difference equation, or coefficients of a polynomial.
+
+    The polynomial is in τ, and its coefficient of τ⁰ comes first.
+    """
+    return [
+        input_row(name, k)
+        for name, taps in model.taps.items()
+        for k in range(degree + 1 if model.is_continuous else taps)
+    ]
+
+
+def known_inputs(model: Model, degree: int, lag: int = 0) -> list[InputRow]:
+    """Which values of an input enter which row of `input_rows`, for all code that feeds a model sample by sample.
+
+    Args:
+        model: the equation.
+        degree: degree of the input's polynomial over a sample of a differential equation: 0 is held at the newest
+            value, 1 goes linearly from the last value to the newest.
+        lag: age of the newest value that acts in a difference equation [samples]: 1 where it takes the last of inputs
+            that go linearly from one value to the next. Values older than `MAX_INPUT_AGE` count as of that age.
+
+    Raises:
+        ValueError: for another degree: the polynomial then needs more values than these.
+    """
+    if degree not in (0, 1):
+        raise ValueError(f"degree must be 0 or 1, but is {degree}; a spline needs the whole record")
+    found = []
+    for channel, (name, taps) in enumerate(model.taps.items()):
+        if not model.is_continuous:
+            found += [InputRow(input_row(name, k), channel, min(k + lag, MAX_INPUT_AGE)) for k in range(taps)]
+        elif degree == 0:
+            found.append(InputRow(input_row(name, 0), channel, 0))
+        else:
+            found += [InputRow(input_row(name, 0), channel, 1), InputRow(input_row(name, 1), channel, 0, 1)]
+    return found
+
+
+def n_older_inputs(model: Model, degree: int, lag: int = 0) -> dict[str, int]:
+    """Number of each input's values before the newest one that `known_inputs` has."""
+    oldest = [0] * model.n_inputs
+    for row in known_inputs(model, degree, lag):
+        oldest[row.channel] = max(oldest[row.channel], row.age, row.subtracted_age or 0)
+    return dict(zip(model.inputs, oldest, strict=True))
 
 
 def integrator_rows(model: Model) -> list[str]:

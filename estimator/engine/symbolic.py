@@ -9,7 +9,7 @@ begin with a capital letter:
 ``F_i_j``   its derivative with respect to quantity j (a state before the sample, or a coefficient)
 ``Q_i_k``   covariance of states i and k by process noise of unit strength
 ``P_i_j``   covariance of quantities i and j before the sample; ``P_PRED_i_j`` is the predicted one
-``U_k``     input over the sample: taps of a difference equation, or coefficients of τ^k in [0, 1]
+``U_i_k``   input i over the sample: tap k of a difference equation, or coefficient of τ^k in [0, 1]
 ==========  ===========================================================================================
 """
 
@@ -21,7 +21,7 @@ from functools import cache
 
 import sympy as sp
 
-from estimator.engine.storage_layout import integrator_rows
+from estimator.engine.storage_layout import input_row, integrator_rows, stage_input
 from estimator.models.model import FUNCTIONS, MAX_POWER, Model, names_in_expression
 
 Assignments = list[tuple[str, sp.Expr]]
@@ -106,7 +106,7 @@ def differentiate(model: Model) -> ModelDerivatives:
     Raises:
         ValueError: for text that is not an expression, or has a name that is not the model's.
     """
-    symbols = {name: symbol(name) for name in (*model.names, "u", *(["u1", "u2"] if not model.is_continuous else []))}
+    symbols = {name: symbol(name) for name in (*model.names, *model.input_ages)}
     moves = tuple(parse_expression(text, symbols, model.name) for text in model.update_expressions)
     without_input = {name: symbols[name] for name in model.names}
     noise = tuple(parse_expression(text, without_input, model.name) for text in model.noise)
@@ -178,7 +178,7 @@ class Propagation:
 def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagation]:
     """M, F and Q of a difference equation: the next state and its derivatives."""
     c = differentiate(model)
-    inputs = {"u": "U_0", "u1": "U_1", "u2": "U_2"}
+    inputs = {written: input_row(*tap) for written, tap in model.input_ages.items()}
     named = {f"M_{i}": move for i, move in zip(model.states, c.moves, strict=True)}
     for i, row in zip(model.states, c.jacobian, strict=True):
         named |= {f"F_{i}_{j}": slope for j, slope in zip(model.dynamic_names, row, strict=True)}
@@ -222,7 +222,11 @@ def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
 
 
 def runge_kutta_4(
-    variables: Sequence[str], rate_assignments: Assignments, substeps: int, sample_length: sp.Expr = sp.S.One
+    variables: Sequence[str],
+    rate_assignments: Assignments,
+    inputs: Iterable[str],
+    substeps: int,
+    sample_length: sp.Expr = sp.S.One,
 ) -> Assignments:
     """One Runge-Kutta step of order 4, from ``variables`` to ``<name>_END``.
 
@@ -230,7 +234,8 @@ def runge_kutta_4(
 
     Args:
         variables: names that are integrated.
-        rate_assignments: assignments of their rates ``RATE_<name>`` in the names and the input ``u``.
+        rate_assignments: assignments of their rates ``RATE_<name>`` in the names and the inputs.
+        inputs: names of the inputs, whose values at the stages `input_at_stages` assigns.
         substeps: steps per sample.
         sample_length: length of the sample, in sampling steps.
     """
@@ -239,7 +244,7 @@ def runge_kutta_4(
     rates: list[dict[str, sp.Expr]] = []
     for k, fraction in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
         tag = "ABCD"[k]
-        at: dict[str, sp.Expr | str] = {"u": f"U_AT_{tag if k != 2 else 'B'}"}
+        at: dict[str, sp.Expr | str] = {i: stage_input(i, tag if k != 2 else "B") for i in inputs}
         for name in variables:
             if k:
                 lines.append((f"{name}_{tag}", symbol(name) + fraction * h * rates[-1][name]))
@@ -262,17 +267,18 @@ def runge_kutta_4(
     ]
 
 
-def input_at_stages(degree: int, substeps: int) -> Assignments:
-    """``U_AT_A``, ``U_AT_B``, ``U_AT_D``: the input at the start, middle and end of a Runge-Kutta step."""
+def input_at_stages(model: Model, degree: int, substeps: int) -> Assignments:
+    """`stage_input` of each input and tag: its value at the start, middle and end of a Runge-Kutta step."""
     h = sp.Rational(1, substeps)
     lines = []
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
-        value: sp.Expr = symbol(f"U_{degree}")
-        if degree:
+        if degree and model.inputs:
             lines.append((f"TAU_{tag}", symbol("TAU") + fraction * h))
-        for k in range(degree - 1, -1, -1):
-            value = symbol(f"U_{k}") + symbol(f"TAU_{tag}") * value
-        lines.append((f"U_AT_{tag}", value))
+        for i in model.inputs:
+            value: sp.Expr = symbol(input_row(i, degree))
+            for k in range(degree - 1, -1, -1):
+                value = symbol(input_row(i, k)) + symbol(f"TAU_{tag}") * value
+            lines.append((stage_input(i, tag), value))
     return lines
 
 
@@ -281,9 +287,9 @@ def state_rk4_step(model: Model, degree: int) -> Assignments:
     at = {symbol(i): symbol(f"M_{i}") for i in model.states}
     rates = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     stages = runge_kutta_4(
-        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model.substeps
+        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model.inputs, model.substeps
     )
-    return input_at_stages(degree, model.substeps) + stages
+    return input_at_stages(model, degree, model.substeps) + stages
 
 
 def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:
@@ -307,11 +313,6 @@ def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tup
         lines.append((f"NEXT_{x}", value))
         results[row_of[x]] = f"NEXT_{x}"
     return substitute(lines, row_of), results
-
-
-def input_at_end(model: Model, degree: int) -> sp.Expr:
-    """The input at the time of the output: the newest tap, or the polynomial's value at the end of the sample."""
-    return sum((symbol(f"U_{k}") for k in range(degree + 1)), sp.S.Zero) if model.is_continuous else symbol("U_0")
 
 
 def reverse_mode_derivative(

@@ -19,7 +19,7 @@ from typing import Any
 import sympy as sp
 
 from estimator.engine import printer_numba, symbolic
-from estimator.engine.storage_layout import integrator_rows, upper_triangle_names
+from estimator.engine.storage_layout import integrator_rows, stage_input, upper_triangle_names
 from estimator.engine.symbolic import (
     Assignments,
     Program,
@@ -66,7 +66,7 @@ def print_integrator(
         degree: degree of the input's polynomial.
         layout: row number of each quantity.
         lanes: lanes of the block.
-        input_values: ``U_k`` to an expression in other rows.
+        input_values: ``U_<input>_<k>`` to an expression in other rows.
         sample_length: length of the sample, in sampling steps.
     """
     if not model.is_continuous:
@@ -87,7 +87,8 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
     stage, slopes = _stage_rates_and_slopes(model)
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
     lines = Program(
-        input_at_stages(degree, model.substeps) + runge_kutta_4(plain_variables, stage, model.substeps, sample_length)
+        input_at_stages(model, degree, model.substeps)
+        + runge_kutta_4(plain_variables, stage, model.inputs, model.substeps, sample_length)
     )
     total: _Slopes = dict.fromkeys(slopes, sp.S.Zero)
     stage_slopes: _Slopes = {}
@@ -128,7 +129,7 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.dynamic_names) for a, i in enumerate(states)}
     if model.held:
         slopes |= {(i, _HELD_NOISE): noise[a] for a, i in enumerate(states)}
-    changing = {symbol("u"), *at.values()}
+    changing = {*map(symbol, model.inputs), *at.values()}
     named |= {f"J_{i}_{j}": slope for (i, j), slope in slopes.items() if slope.free_symbols & changing}
     for a in range(n):
         for b in range(a, 0 if model.held else n):
@@ -168,11 +169,11 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
         Q = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
     states = list(model.states)
-    lines = Program(symbolic.substitute(input_at_stages(degree, 1), {"TAU": sp.S.Zero}))
+    lines = Program(symbolic.substitute(input_at_stages(model, degree, 1), {"TAU": sp.S.Zero}))
     points = {tag: {i: symbol(f"{at}{i}") for i in states} for tag, at in (("A", ""), ("B", "MIDDLE_"), ("D", "END_"))}
     end = {symbol(i): value for i, value in points["D"].items()}
     noise = [g.xreplace(end) for g in differentiate(model).noise]
-    slopes = {tag: _slopes_at(model, tag, point, symbol(f"U_AT_{tag}"), lines) for tag, point in points.items()}
+    slopes = {tag: _slopes_at(model, tag, point, lines) for tag, point in points.items()}
     slopes["C"] = slopes["B"]
     stage_slopes: _Slopes = {}
     total: _Slopes = dict.fromkeys(slopes["A"], sp.S.Zero)
@@ -213,12 +214,12 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
     )
 
 
-def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], u: sp.Expr, lines: Program) -> _Slopes:
-    """Jacobian of the rates at a state and an input; common subexpressions are assigned to ``lines``, with a tag."""
+def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], lines: Program) -> _Slopes:
+    """Jacobian of the rates at a state and the stage's inputs; common parts are assigned to ``lines``, with a tag."""
     stage, slopes = _stage_rates_and_slopes(model)
     stage = [(name, value) for name, value in stage if not name.startswith("RATE_")]
     tagged = {name: f"{name}_{tag}" for name, _ in stage}
-    values_at = {f"M_{i}": value for i, value in point.items()} | {"u": u}
+    values_at = {f"M_{i}": value for i, value in point.items()} | {u: symbol(stage_input(u, tag)) for u in model.inputs}
     lines += symbolic.substitute(stage, {**tagged, **values_at})
     named = [("", symbol(f"J_{i}_{j}") if f"J_{i}_{j}" in tagged else value) for (i, j), value in slopes.items()]
     return dict(zip(slopes, (value for _, value in symbolic.substitute(named, {**tagged, **values_at})), strict=True))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from estimator.belief import Belief
 from estimator.compilation.simd import LANES, kernel
 from estimator.engine import kernels
-from estimator.engine.storage_layout import belief_rows
+from estimator.engine.storage_layout import belief_rows, first_input_row
 from estimator.inference import mean_field
 from estimator.inference.input_interpolation import input_stencil, record_lengths, rig_input_degree
 from estimator.inference.record_filter import outputs_by_sensor
@@ -81,7 +81,7 @@ def _compile_batch_filter(model: Model, degree: int, factorisation: str) -> Any:
         belief_update = kernels.compile_belief_update(model, degree, iterations=iterations)
         layout, update_all = dict(belief_update.layout), belief_update.update
     is_structured = factorisation == "structured"
-    u_row, y_row = layout["U_0"] * LANES, layout[f"Y_{next(iter(model.outputs))}"] * LANES
+    u_row, y_row = first_input_row(layout, model) * LANES, layout[f"Y_{next(iter(model.outputs))}"] * LANES
     n_rows, size = len(layout), len(belief_rows(model))
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}_{factorisation}")

@@ -17,7 +17,7 @@ from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import LANES, jit, jit_closure, kernel
 from estimator.engine import kernels
 from estimator.engine.source_cache import variant_digest
-from estimator.engine.storage_layout import belief_rows
+from estimator.engine.storage_layout import belief_rows, first_input_row
 from estimator.engine.variational_free_energy import compile_free_energies
 from estimator.inference import mean_field
 from estimator.inference.member_steps import compile_member_steps
@@ -253,7 +253,7 @@ def _compile_walk(variant: str, model: Model, layout: Mapping[str, int], lanes: 
 
 def _compile_sample_loader(variant: str, model: Model, layout: Mapping[str, int], lanes: int) -> Any:
     """Compile ``load_sample(W, inputs, start, stencil, output)``: inputs and outputs of a sample."""
-    u_row = layout["U_0"] * lanes
+    u_row = first_input_row(layout, model) * lanes
     y_row = layout[f"Y_{next(iter(model.outputs))}"] * lanes
     sensors = model.n_outputs
 

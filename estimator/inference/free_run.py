@@ -81,14 +81,14 @@ def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic
+        from estimator.engine.inputs_at_end import inputs_at_end
 
         lines, results = symbolic.propagate_state(model, degree, {name: name for name in model.names})
         uniform = ("TAU",) if model.is_continuous else ()
         source = printer_numba.print_lane_loop(
             "move", lines, results, layout, 1, uniform, doc="One sample, or one Runge-Kutta step, of the state."
         )
-        end = symbolic.input_at_end(model, degree)
-        shown = symbolic.substitute([("", symbolic.differentiate(model).outputs[0])], {"u": end})[0][1]
+        shown = symbolic.differentiate(model).outputs[0].xreplace(inputs_at_end(model, degree))
         return source + printer_numba.print_lane_loop(
             "sense", [("OUTPUT", shown)], {"Y_PRED": "OUTPUT"}, layout, 1, doc="The output."
         )
@@ -104,7 +104,7 @@ def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
         for i in range(len(starts)):
             copy(W, 0, starts[i], n)
             for t in range(u.shape[1]):
-                feed(W, 0, u[i, t], u[i, t - 1] if t > 0 else 0.0, u[i, t - 2] if t > 1 else 0.0)
+                feed(W, 0, 0, u[i, t], u[i, t - 1] if t > 0 else 0.0, u[i, t - 2] if t > 1 else 0.0)
                 if continuous:
                     for s in range(steps):
                         move(W, s / steps)
@@ -117,7 +117,7 @@ def _compile_free_run(model: Model, degree: int) -> tuple[Any, Any]:
     def output_of(start, u):
         W = np.zeros(size)
         copy(W, 0, start, n)
-        feed(W, 0, u, u, u)
+        feed(W, 0, 0, u, u, u)
         sense(W)
         return W[shown]
 

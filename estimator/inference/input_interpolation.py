@@ -12,7 +12,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from estimator.models.interpolation import INTERPOLATION_DEGREES
+from estimator.engine.storage_layout import known_inputs, n_older_inputs
+from estimator.models.interpolation import CAUSAL_INTERPOLATION_DEGREES, INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
@@ -78,15 +79,24 @@ def input_stencil(model: Model, rig: Rig) -> InputStencil:
         ValueError: for a fractional delay or a lag, which only `identify` supports.
     """
     delay = rig.integer_delay
-    if not model.is_continuous:
-        return _lagged_stencil(np.eye(model.taps)[::-1], delay)
-    if rig.interpolation == "zero_order":
-        return _lagged_stencil(np.ones((1, 1)), delay + 1)
-    if rig.interpolation == "linear":
-        return _lagged_stencil(np.array([[1.0, 0.0], [-1.0, 1.0]]), delay)
+    if rig.interpolation in CAUSAL_INTERPOLATION_DEGREES or not model.is_continuous:
+        first_effect = int(model.is_continuous and rig.interpolation == "zero_order")
+        return _lagged_stencil(_causal_stencil(model, rig_input_degree(model, rig)), delay + first_effect)
     if rig.interpolation == "look_ahead":
         return _lagged_stencil(_look_ahead_stencil(), delay - 1, repeats_first=True)
     return InputStencil(np.eye(_SPLINE_DEGREE + 1), 0, repeats_first=True, needs_whole_record=True, delay=delay)
+
+
+def _causal_stencil(model: Model, degree: int) -> FloatArray:
+    """(rows, window) weights of the values that `known_inputs` has, oldest first."""
+    rows = known_inputs(model, degree)
+    window = 1 + max(n_older_inputs(model, degree).values(), default=0)
+    stencil = np.zeros((len(rows), window))
+    for i, row in enumerate(rows):
+        stencil[i, window - 1 - row.age] = 1.0
+        if row.subtracted_age is not None:
+            stencil[i, window - 1 - row.subtracted_age] = -1.0
+    return stencil
 
 
 def record_lengths(series: FloatArray) -> npt.NDArray[np.int64]:

@@ -80,7 +80,7 @@ def compile_mean_field(layout: Mapping[str, int], lanes: int = LANES) -> MeanFie
 
 
 def compile_mean_field_update(layout: Mapping[str, int]) -> Any:
-    """Compile ``update(W, iterations, as_published)``, which updates every lane's belief by its ``U_0`` and ``Y_y``."""
+    """Compile ``update(W, iterations, as_published)``, the update of every lane by its ``U_u_0`` and ``Y_y``."""
     begin, iterate, end, _ = compile_mean_field(layout)
 
     @jit_closure(variant_digest(sorted(layout.items())))
@@ -119,14 +119,14 @@ def begin(
 
 
 def iterate(
-    theta1, theta2, theta3, z0, q0, q1, U_0, Y_y, gamma, xi, GAMMA_SHAPE, XI_SHAPE_y,
+    theta1, theta2, theta3, z0, q0, q1, U_u_0, Y_y, gamma, xi, GAMMA_SHAPE, XI_SHAPE_y,
     prior_theta1, prior_theta2, prior_theta3, prior_eta,
     prior_V_11, prior_V_12, prior_V_13, prior_V_22, prior_V_23, prior_V_33, prior_eta_variance,
     prior_L_00, prior_L_01, prior_L_11, prior_h_0, prior_h_1, prior_gamma_rate, prior_xi_rate,
     as_published,
 ):  # fmt: skip
     """One iteration of the six updates. The shapes of both precisions include this sample already."""
-    u, y = U_0, Y_y
+    u, y = U_u_0, Y_y
     # η: the residual E[x_t] - g under the last θ.
     regression = theta1 * q0 + theta2 * (q0 * q0 * q0) + theta3 * q1
     eta_information = gamma * u * u * prior_eta_variance

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from estimator.compilation.simd import jit, kernel
 from estimator.engine.kernels import compile_linearised_filter
-from estimator.engine.storage_layout import likelihood_total_rows
+from estimator.engine.storage_layout import first_input_row, known_inputs, likelihood_total_rows
 from estimator.inference.input_interpolation import record_lengths
-from estimator.models.model import Model
+from estimator.models.model import MAX_INPUT_AGE, Model
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
@@ -37,14 +37,22 @@ class RecordLikelihoods(NamedTuple):
 
 
 def inputs_by_sample(model: Model, u: FloatArray, degree: int = 0) -> FloatArray:
-    """(n, T, rows) input of each sample, from inputs (n, T) that are 0 before the first.
+    """(n, T, rows) inputs of each sample, from inputs (n, T) or (n, T, inputs) that are 0 before the first.
 
-    Rows are the taps of a difference equation, newest first, or the polynomial of degree 0 (held) or 1 (linear).
+    The rows are `estimator.engine.storage_layout.input_rows`, for the degree 0 (held) or 1 (linear).
     """
-    before = [np.concatenate([np.zeros((len(u), lag)), u[:, : u.shape[1] - lag]], axis=1) for lag in range(3)]
-    if model.is_continuous and degree == 1:
-        return np.stack([before[1] + 0.0 * u, u - before[1]], axis=2)
-    return np.stack(before[: model.taps], axis=2) + 0.0 * u[..., None]  # NaN beyond the end
+    channels = u if u.ndim == 3 else u[..., None]
+    ages = [
+        np.concatenate([np.zeros((len(u), age, model.n_inputs)), channels[:, : u.shape[1] - age]], axis=1)
+        for age in range(MAX_INPUT_AGE + 1)
+    ]
+    rows = known_inputs(model, degree)
+    found = np.empty((*u.shape[:2], len(rows)))
+    for i, row in enumerate(rows):
+        value = ages[row.age][..., row.channel]
+        value = value if row.subtracted_age is None else value - ages[row.subtracted_age][..., row.channel]
+        found[..., i] = value + 0.0 * channels[..., row.channel]  # NaN beyond the end
+    return found
 
 
 def record_likelihoods(
@@ -212,7 +220,7 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
         n_totals=len(likelihood_total_rows(model)),
         coefficient=rows[next(iter(model.coefficients))],
         noise=rows["PROCESS_VARIANCE"],
-        input=rows["U_0"],
+        input=first_input_row(rows, model),
         sample_length=rows["SAMPLE_LENGTH"] if variable_step else -1,
         is_counted=rows["IS_COUNTED"],
         first_total=rows["LOSS"],

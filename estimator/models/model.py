@@ -17,7 +17,7 @@ from functools import cached_property
 
 from estimator.support.argument_checks import check_bool, check_integer, check_mapping, short_repr
 
-#: Names of states, coefficients and sensors; names with capital letters belong to the engine.
+#: Names of inputs, states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
 
 #: Functions that expressions may use.
@@ -29,9 +29,15 @@ GENERATED_FUNCTIONS = tuple("sign" if name == "abs" else name for name in FUNCTI
 #: Highest power in an expression; integer powers are computed as products.
 MAX_POWER = 16
 
-#: Names with another meaning: the input and its older values, the sampling step, and functions of generated code.
-RESERVED_NAMES = frozenset({"u", "u1", "u2", "step", *FUNCTIONS, *GENERATED_FUNCTIONS, "capped", "range"})
+#: Names with another meaning: the sampling step, and functions of generated code.
+RESERVED_NAMES = frozenset({"step", *FUNCTIONS, *GENERATED_FUNCTIONS, "capped", "range"})
 
+
+#: The inputs of a model that names none.
+DEFAULT_INPUTS = {"u": ""}
+
+#: Largest number of samples by which an input of a difference equation may be older than the newest.
+MAX_INPUT_AGE = 2
 
 #: Syntax nodes that an expression may have.
 _ALLOWED_SYNTAX = (
@@ -75,10 +81,10 @@ class Model:
     """The equation of a plant with unknown coefficients.
 
     A model has either ``rates`` (a differential equation; time counts samples) or ``next_state`` (a difference
-    equation). All expressions are strings in the names of states and coefficients and the input ``u``, with ``sin``,
-    ``cos``, ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose derivative at 0 counts as 0. In a difference
-    equation ``u`` is the newest input that acts on the next state, and ``u1`` and ``u2`` are the inputs one and two
-    samples before.
+    equation). All expressions are strings in the names of states, coefficients and inputs, with ``sin``, ``cos``,
+    ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose derivative at 0 counts as 0. In a difference equation the
+    input ``u`` is its newest value, which acts on the next state, and ``u1`` and ``u2`` are its values one and two
+    samples before; likewise for any other input.
 
     Attributes:
         name: name of the model, for messages and generated files.
@@ -88,6 +94,7 @@ class Model:
             force that is constant over a sample where ``held``; for a next state, the added noise.
         outputs: sensor to its measured quantity, without sensor noise; at least one. The strength of the process noise
             is its effect on the first sensor within one sample.
+        inputs: input to unit, in the order of arrays and actions; ``{}`` has none. The default is one input, ``u``.
         rates: time derivatives of the states.
         next_state: the states one sample later.
         held: whether the process noise of a differential equation is held over each sample, and not white.
@@ -113,6 +120,7 @@ class Model:
     coefficients: Mapping[str, str]
     noise: tuple[str, ...]
     outputs: Mapping[str, str]
+    inputs: Mapping[str, str] = field(default_factory=DEFAULT_INPUTS.copy)
     rates: tuple[str, ...] = ()
     next_state: tuple[str, ...] = ()
     held: bool = False
@@ -122,7 +130,7 @@ class Model:
     inverse: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for field_name in ("states", "coefficients", "outputs", "physical", "inverse"):
+        for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
         for field_name in ("noise", "rates", "next_state"):
@@ -143,7 +151,7 @@ class Model:
                 raise ValueError(
                     f"dimensions of {field_name} must be three whole numbers, but are {short_repr(powers)}"
                 )
-        names = [*self.states, *self.coefficients, *self.outputs]
+        names = [*self.states, *self.coefficients, *self.outputs, *self.input_ages]
         for name in (self.name, *names):
             if not _NAME_PATTERN.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED_NAMES:
                 raise ValueError(
@@ -152,7 +160,9 @@ class Model:
                 )
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise ValueError(f"states, coefficients and outputs must have different names, but share {repeated}")
+            raise ValueError(
+                f"states, coefficients, outputs and inputs must have different names, but share {repeated}; rename one"
+            )
         # With x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the covariance P_x_a_b.
         joined_names = [f"{i}_{j}" for i in self.names for j in self.names]
         shared = sorted({pair for pair in joined_names if joined_names.count(pair) > 1})
@@ -187,7 +197,7 @@ class Model:
 
     def _validate_expressions(self) -> None:
         """Refuse expressions with unknown names, coefficients without effect, and outputs without a state."""
-        inputs = ("u",) if self.is_continuous else ("u", "u1", "u2")
+        inputs = tuple(self.input_ages)
         for texts, known in ((self.physical, self.coefficients), (self.inverse, self.physical)):
             for text in texts.values():
                 names_in_expression(text, (*known, "step"), self.name)
@@ -235,11 +245,25 @@ class Model:
         """States, then coefficients: the order of joint means and covariances."""
         return (*self.states, *self.coefficients)
 
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def input_ages(self) -> dict[str, tuple[str, int]]:
+        """Name of an input's value in expressions, to the input and its age [samples]; the newest has the age 0."""
+        ages = range(1 if self.is_continuous else MAX_INPUT_AGE + 1)
+        return {f"{name}{age or ''}": (name, age) for name in self.inputs for age in ages}
+
     @cached_property
-    def taps(self) -> int:
-        """Number of inputs in a difference equation: 1, or 2 or 3 where it contains ``u1`` or ``u2``."""
-        text = " ".join((*self.update_expressions, *self.outputs.values()))
-        return max(i + 1 for i in range(3) if i == 0 or re.search(rf"\bu{i}\b", text))
+    def taps(self) -> dict[str, int]:
+        """Number of values of each input in a difference equation: 1, or 2 or 3 where it contains older ones."""
+        used = set(re.findall(r"[a-z]\w*", " ".join((*self.update_expressions, *self.outputs.values()))))
+        oldest = dict.fromkeys(self.inputs, 0)
+        for written, (name, age) in self.input_ages.items():
+            oldest[name] = max(oldest[name], age if written in used else 0)
+        return {name: age + 1 for name, age in oldest.items()}
 
     @cached_property
     def dynamic_names(self) -> tuple[str, ...]:
@@ -250,8 +274,10 @@ class Model:
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits that identify the model."""
-        # The fields alone, without cached properties.
+        # The fields alone, without cached properties. Oracles are named by it, so one input `u` adds nothing.
         values = {one.name: getattr(self, one.name) for one in fields(self)}
+        if dict(self.inputs) == DEFAULT_INPUTS:
+            del values["inputs"]
         text = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -9,7 +9,7 @@ import pytest
 from agents.planning.d_optimality import DIVERGED_RATIO, NominalSystem, compile_d_optimality
 from agents.planning.open_loop.expected_d_optimality import SampledSystems, compile_expected_d_optimality
 from estimator.compilation.simd import LANES
-from estimator.engine.input_hold import n_older_inputs
+from estimator.engine.storage_layout import n_older_inputs
 
 sys.path.append(str(Path(__file__).parents[1] / "estimator"))
 from reference.plants import CASES
@@ -26,7 +26,7 @@ def drawn(name, systems):
     starts = np.zeros((systems, compile_d_optimality(model, degree).start_size))
     starts[:, :n] = 0.05 * size * rng.standard_normal((systems, n))
     starts[:, n : n + n * (n + 1) // 2] = 1e-6 * np.eye(n)[np.triu_indices(n)]
-    older = n_older_inputs(model, degree)
+    older = max(n_older_inputs(model, degree).values())
     starts[:, starts.shape[1] - older :] = size * rng.uniform(-1, 1, (systems, older))
     noises = 1e-6 * rng.uniform(1.0, 4.0, (systems, 1 + model.n_outputs))
     shakes = 0.1 * size * rng.standard_normal((systems, SAMPLES))

@@ -169,7 +169,7 @@ def block_of(records, u, y, lanes):
     """A block (rows * lanes,) of records (lanes, SIZE), inputs (lanes,) and outputs (lanes,)."""
     block = np.zeros((len(LAYOUT), lanes))
     block[:SIZE] = np.transpose(records)
-    block[LAYOUT["U_0"]], block[LAYOUT["Y_y"]] = u, y
+    block[LAYOUT["U_u_0"]], block[LAYOUT["Y_y"]] = u, y
     return block.reshape(-1)
 
 

@@ -20,8 +20,7 @@ from agents.planning.d_optimality import DIVERGED_RATIO, half_log_det, invert_fr
 from estimator.compilation.array_operations import fill
 from estimator.compilation.simd import LANES, jit_closure, kernel
 from estimator.engine.information_gradient_simd import compile_lane_adjoint
-from estimator.engine.input_hold import n_older_inputs
-from estimator.engine.storage_layout import input_rows, linearised_filter_rows
+from estimator.engine.storage_layout import input_row, input_rows, linearised_filter_rows, n_older_inputs
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -136,7 +135,7 @@ def _layout(model: Model, degree: int) -> _Layout:
     return _Layout(
         F=at[f"INFORMATION_{first}_{first}"],
         C=at[first],
-        U=at["U_0"],
+        U=at[input_row(next(iter(model.inputs)), 0)],
         Q=at["PROCESS_VARIANCE"],
         SHOWN=at[f"Y_PRED_{next(iter(model.outputs))}"],
         LIVE=at["IS_COUNTED"],
@@ -144,7 +143,7 @@ def _layout(model: Model, degree: int) -> _Layout:
         n_tape=lane_paths.n_tape,
         n_path=len(linearised_filter_rows(model)),
         n_inputs=len(input_rows(model, degree)),
-        n_older=n_older_inputs(model, degree),
+        n_older=max(n_older_inputs(model, degree).values()),
         k=k,
         entries=k * (k + 1) // 2,
         n_noises=1 + model.n_outputs,

@@ -103,7 +103,7 @@ def noise_as_input(model: Model) -> Callable[..., FloatArray]:
 
     from estimator.engine.symbolic import differentiate, symbol
 
-    motion_equations, u = differentiate(model), symbol("u")
+    motion_equations, u = differentiate(model), symbol(next(iter(model.inputs)))
     moved = {name: sp.diff(move, u) for name, move in zip(model.states, motion_equations.moves, strict=True)}
     forces = [
         noise / moved[name] for name, noise in zip(model.states, motion_equations.noise, strict=True) if noise != 0
