@@ -7,6 +7,7 @@ a Gaussian prior that is wide beside the information of a sample, under three ti
 rest.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from estimator import (
 )
 from estimator.belief import Belief
 from estimator.models.difference_equation import PRESETS, Term
+from estimator.models.expression import evaluate, parse
 from estimator.priors import log_uniform_moments
 from estimator.support.array_types import FloatArray
 
@@ -217,20 +219,21 @@ def simulate(
         below `MAX_DISPLACEMENT`.
     """
     n, samples = u.shape
-    known = dict(zip(model.coefficients, coefficients.T, strict=True)) | {"sqrt": np.sqrt}
-    moves = [compile(text, model.name, "eval") for text in model.update_expressions]
-    shown = compile(next(iter(model.outputs.values())), model.name, "eval")
-    strengths = [eval(text, {"sqrt": np.sqrt}) for text in model.noise]
+    known, functions = dict(zip(model.coefficients, coefficients.T, strict=True)), {"sqrt": np.sqrt}
+    moves = [parse(text, model.name) for text in model.update_expressions]
+    shown = parse(next(iter(model.outputs.values())), model.name)
+    strengths = [evaluate(parse(text, model.name), {}, functions) for text in model.noise]
     state = np.zeros((model.n_states, n)) if start is None else start.T.copy()
     state[0] += known.get("output_offset", 0.0)
     signal, stayed, none = np.empty_like(u), np.ones(n, dtype=bool), np.zeros(n)
 
-    def names(state: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:
-        return known | dict(zip(model.states, state, strict=True)) | inputs
+    def names(state: FloatArray, inputs: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        return known | dict(zip(model.states, state, strict=True)) | dict(inputs)
 
-    def moved(state: FloatArray, noise: FloatArray, **inputs: FloatArray) -> FloatArray:
-        values = names(state, **inputs)
-        return np.array([eval(move, values) + by * noise for move, by in zip(moves, strengths, strict=True)])
+    def moved(state: FloatArray, noise: FloatArray, inputs: Mapping[str, FloatArray]) -> FloatArray:
+        values = names(state, inputs)
+        rates = (evaluate(move, values, functions) for move in moves)
+        return np.array([rate + by * noise for rate, by in zip(rates, strengths, strict=True)])
 
     h = 1 / model.substeps
     for t in range(samples):
@@ -238,14 +241,14 @@ def simulate(
         if model.is_continuous:
             for i in range(model.substeps):
                 begin, middle, end = (last + (now - last) * (i + part) * h for part in (0.0, 0.5, 1.0))
-                r1 = moved(state, w[:, t], u=begin)
-                r2 = moved(state + h / 2 * r1, w[:, t], u=middle)
-                r3 = moved(state + h / 2 * r2, w[:, t], u=middle)
-                r4 = moved(state + h * r3, w[:, t], u=end)
+                r1 = moved(state, w[:, t], {"u": begin})
+                r2 = moved(state + h / 2 * r1, w[:, t], {"u": middle})
+                r3 = moved(state + h / 2 * r2, w[:, t], {"u": middle})
+                r4 = moved(state + h * r3, w[:, t], {"u": end})
                 state = state + h / 6 * (r1 + 2 * r2 + 2 * r3 + r4)
         else:
-            state = moved(state, w[:, t], u=now, u1=last, u2=older)
+            state = moved(state, w[:, t], {"u": now, "u[-1]": last, "u[-2]": older})
             stayed &= np.abs(state[0]) < MAX_DISPLACEMENT
             state[:, ~stayed] = 0.0  # so that those that left do not overflow
-        signal[:, t] = eval(shown, names(state, u=now))
+        signal[:, t] = evaluate(shown, names(state, {"u": now}), functions)
     return signal, stayed

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from estimator.belief import Belief
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
+from estimator.models.expression import older_input
 from estimator.models.model import Model
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.rigs.silverbox_constants import SILVERBOX_ODE_TWIN, SILVERBOX_TWIN
@@ -310,7 +311,7 @@ def _recorded_duffing(model: Model, spread: float) -> tuple[FloatArray, FloatArr
 def _recorded_difference(model: Model, spread: float) -> tuple[FloatArray, FloatArray]:
     twin = coefficients_of(difference(), SILVERBOX_TWIN)
     centers = dict(zip(("x1", "x1**3", "x2"), twin[:3], strict=True))
-    centers["u" if model.taps["u"] == 1 else "u1"] = twin[3]
+    centers[older_input("u", min(model.taps["u"] - 1, 1))] = twin[3]
     terms = [part.split("*", 1)[1] for part in model.next_state[0].split(" + ")]
     stds = {"V": 0.1 * spread, "1": spread}
     std = [stds.get(unit, 1 + spread) for unit in model.coefficients.values()]

@@ -130,6 +130,7 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
     It also stores the inverse of each true parameter, so that no sample divides to compare an estimate with the truth.
     """
     from estimator.engine import symbolic
+    from estimator.engine.expression_parser import parse_expression
 
     parameter_symbols = {p: symbolic.symbol(p) for p in parameter_names(spec.truth_model)}
     lines, results = [], {}
@@ -138,7 +139,7 @@ def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:
         coefficient_values = {}
         for c in model.coefficients:
             text = model.inverse[c] if model.inverse else c
-            value = symbolic.parse_expression(text, {**parameter_symbols, "step": symbolic.symbol("step")}, model.name)
+            value = parse_expression(text, {**parameter_symbols, "step": symbolic.symbol("step")}, model)
             coefficient_values[f"V_{c}"] = symbolic.substitute(
                 [("", value)], {p: f"PARAM_{p}" for p in parameter_symbols}
             )[0][1]
@@ -155,6 +156,7 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     import sympy as sp
 
     from estimator.engine import symbolic
+    from estimator.engine.expression_parser import parse_expression
 
     symbol, model = symbolic.symbol, spec.belief_model
     deviations = {c: symbol(f"TRUE_{c}") - symbol(c) for c in model.coefficients}
@@ -164,7 +166,7 @@ def _belief_beside_truth(spec: KernelSpec) -> tuple[Any, Any]:
     coefficient_symbols = {c: symbol(c) for c in model.coefficients} | {"step": symbol("step")}
     capped_error_symbol = sp.Function("capped_error")
     ratios = {
-        f"RATIO_{p}": symbolic.parse_expression(text, coefficient_symbols, model.name) * symbol(f"INVERSE_TRUE_{p}")
+        f"RATIO_{p}": parse_expression(text, coefficient_symbols, model) * symbol(f"INVERSE_TRUE_{p}")
         for p, text in estimated_expressions(model).items()
     }
     lines += symbolic.eliminate_common_subexpressions(ratios, "RW")

@@ -189,6 +189,29 @@ def tanh(x):
     return value if x >= 0.0 else -value
 
 
+_TAN_3_PI_8 = math.tan(3 * math.pi / 8)
+_ATAN_P0 = -8.750608600031904122785e-1
+
+
+@scalar_jit
+def atan(x):
+    """Arc tangent to 2 units in the last place, without branches, by the rational minimax approximation of Cephes."""
+    a = abs(x)
+    is_large, is_medium = a > _TAN_3_PI_8, a > 0.66
+    numerator = -1.0 if is_large else (a - 1.0 if is_medium else a)
+    denominator = a if is_large else (a + 1.0 if is_medium else 1.0)
+    turn = math.pi / 2 if is_large else (math.pi / 4 if is_medium else 0.0)
+    rest = 6.123233995736765886130e-17 if is_large else (3.061616997868382943065e-17 if is_medium else 0.0)
+    r = numerator / denominator
+    z = r * r
+    p = -1.228866684490136173410e2 + z * (-7.500855792314704667340e1 + z * (-1.615753718733365076637e1 + z * _ATAN_P0))
+    p = -6.485021904942025371773e1 + z * p
+    q = 4.328810604912902668951e2 + z * (1.650270098316988542046e2 + z * (2.485846490142306297962e1 + z))
+    q = 1.945506571482613964425e2 + z * (4.853903996359136964868e2 + z * q)
+    value = turn + (r + (r * (z * p / q) + rest))
+    return value if x >= 0.0 else -value
+
+
 @scalar_jit
 def sign(x):
     """-1, 0 or 1; NaN of NaN, without branches."""

@@ -24,7 +24,8 @@ from estimator.engine.storage_layout import (
     trace_rows,
     update_layout,
 )
-from estimator.models.model import GENERATED_FUNCTIONS, Model
+from estimator.models.expression import GENERATED_FUNCTIONS
+from estimator.models.model import Model
 from estimator.support.argument_checks import check_choice, check_integer
 from estimator.support.update_options import EXPECTATIONS, MAX_ITERATIONS
 

@@ -178,7 +178,7 @@ def _output_velocity_and_gain(model: Model) -> tuple[Any, Any, Any]:
     from estimator.engine.symbolic import differentiate, symbol
 
     derivatives, u = differentiate(model), symbol("u")
-    constant_input = {symbol(name): u for name in ("u1", "u2")}
+    constant_input = {symbol(written): u for written in model.input_ages}
     moves = dict(zip(map(symbol, model.states), (m.xreplace(constant_input) for m in derivatives.moves), strict=True))
     shown = derivatives.outputs[0].xreplace({u: sp.S.Zero})
 

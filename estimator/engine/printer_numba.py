@@ -7,6 +7,7 @@ is ``W[r * lanes + j]``. The constant offsets into one array let the compiler ve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
@@ -26,12 +27,24 @@ _INLINE_TEMPLATES = {
     "reaches": "(1.0 if {0} >= {1} else 0.0)",
     "select": "({1} if {0} > 0.0 else {2})",
     "where_valid": "({0} if {1} > 0.0 and {2} > 0.0 and {3} > 0.0 and {4} >= 0.0 and {5} >= 0.0 else NAN)",
+    "magnitude": "abs({0})",
+    "if_greater": "({2} if {0} > {1} else {3})",
+    "unless_less": "({2} if {0} >= {1} else {3})",
     "clip": "({1} if not {0} > {1} else ({0} if {0} < {2} else {2}))",
+}
+
+#: The same functions for arrays, where maps between coefficients and parameters have them.
+_ARRAY_TEMPLATES = {
+    "magnitude": "abs({0})",
+    "if_greater": "where({0} > {1}, {2}, {3})",
+    "unless_less": "where({0} >= {1}, {2}, {3})",
 }
 
 
 class _NumbaPrinter(PythonCodePrinter):
-    """Prints numbers as floats, small powers as products, and functions by bare names."""
+    """Prints numbers as floats, small powers as products, and functions by bare names or templates."""
+
+    templates: ClassVar[Mapping[str, str]] = _INLINE_TEMPLATES
 
     def _print_Integer(self, expr: sp.Integer) -> str:
         return f"{int(expr)}.0"
@@ -41,6 +54,11 @@ class _NumbaPrinter(PythonCodePrinter):
 
     def _print_Float(self, expr: sp.Float) -> str:
         return repr(float(expr))
+
+    def _print_NumberSymbol(self, expr: sp.NumberSymbol) -> str:
+        return repr(float(expr))
+
+    _print_Pi = _print_Exp1 = _print_NumberSymbol
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
@@ -54,23 +72,31 @@ class _NumbaPrinter(PythonCodePrinter):
 
     def _print_Function(self, expr: sp.Function) -> str:
         name, given = expr.func.__name__, [self._print(argument) for argument in expr.args]
-        if name in _INLINE_TEMPLATES:
-            return _INLINE_TEMPLATES[name].format(*given)
+        if name in self.templates:
+            return self.templates[name].format(*given)
         return f"{name}({', '.join(given)})"
 
-    _print_sin = _print_cos = _print_tanh = _print_exp = _print_log = _print_sign = _print_Function
+    _print_sin = _print_cos = _print_tanh = _print_atan = _print_exp = _print_log = _print_sign = _print_Function
 
-    def _print_DiracDelta(self, expr: sp.DiracDelta) -> str:
-        # The derivative of a sign counts as 0, at the jump too.
-        return "0.0"
+
+class _ArrayPrinter(_NumbaPrinter):
+    """Prints expressions of arrays, for NumPy."""
+
+    templates = _ARRAY_TEMPLATES
 
 
 _PRINTER = _NumbaPrinter({"fully_qualified_modules": False})
+_ARRAY_PRINTER = _ArrayPrinter({"fully_qualified_modules": False})
 
 
 def print_expression(expression: sp.Expr) -> str:
     """Python source of an expression."""
     return str(_PRINTER.doprint(expression))
+
+
+def print_array_expression(expression: sp.Expr) -> str:
+    """NumPy source of an expression of arrays."""
+    return str(_ARRAY_PRINTER.doprint(expression))
 
 
 def print_lane_loop(

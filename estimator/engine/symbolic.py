@@ -21,8 +21,9 @@ from functools import cache
 
 import sympy as sp
 
+from estimator.engine.expression_parser import parse_expression
 from estimator.engine.storage_layout import input_row, integrator_rows, stage_input
-from estimator.models.model import FUNCTIONS, MAX_POWER, Model, names_in_expression
+from estimator.models.model import Model
 
 Assignments = list[tuple[str, sp.Expr]]
 
@@ -57,15 +58,6 @@ class Program(Assignments):
             return expression
         self.append((name, expression))
         return symbol(name)
-
-
-def _absolute_value(value: sp.Expr) -> sp.Expr:
-    """|value|, as a square root where SymPy cannot prove that the value is real, such as a logarithm."""
-    value = sp.sympify(value)
-    return sp.Abs(value) if value.is_extended_real else sp.sqrt(value**2)
-
-
-_FUNCTIONS = {name: getattr(sp, name) for name in FUNCTIONS if name != "abs"} | {"abs": _absolute_value}
 
 
 def symbol(name: str) -> sp.Symbol:
@@ -107,42 +99,13 @@ def differentiate(model: Model) -> ModelDerivatives:
         ValueError: for text that is not an expression, or has a name that is not the model's.
     """
     symbols = {name: symbol(name) for name in (*model.names, *model.input_ages)}
-    moves = tuple(parse_expression(text, symbols, model.name) for text in model.update_expressions)
+    moves = tuple(parse_expression(text, symbols, model) for text in model.update_expressions)
     without_input = {name: symbols[name] for name in model.names}
-    noise = tuple(parse_expression(text, without_input, model.name) for text in model.noise)
-    outputs = tuple(parse_expression(text, symbols, model.name) for text in model.outputs.values())
+    noise = tuple(parse_expression(text, without_input, model) for text in model.noise)
+    outputs = tuple(parse_expression(text, symbols, model) for text in model.outputs.values())
     jacobian = tuple(tuple(sp.diff(move, symbols[name]) for name in model.dynamic_names) for move in moves)
     output_slopes = tuple(tuple(sp.diff(shown, symbols[name]) for name in model.names) for shown in outputs)
     return ModelDerivatives(moves, jacobian, noise, outputs, output_slopes)
-
-
-def parse_expression(text: str, symbols: Mapping[str, sp.Symbol], model_name: str) -> sp.Expr:
-    """Parse an expression of a model.
-
-    Args:
-        text: the expression.
-        symbols: name to its symbol.
-        model_name: of the model, for messages.
-
-    Raises:
-        ValueError: with the text, for anything but an expression in these names.
-    """
-    names_in_expression(text, symbols, model_name)
-    try:
-        parsed = sp.sympify(eval(text.strip(), {"__builtins__": {}}, {**_FUNCTIONS, **symbols}))
-    except (ArithmeticError, NameError, TypeError, AttributeError, sp.SympifyError) as error:
-        raise ValueError(f"expressions of {model_name} must be formulas, but {text!r} is not one: {error}") from error
-    if not isinstance(parsed, sp.Expr):
-        raise ValueError(f"expressions of {model_name} must be numbers, but {text!r} is {parsed!r}")
-    if parsed.has(sp.I, sp.nan, sp.zoo, sp.oo, -sp.oo):
-        raise ValueError(f"expressions of {model_name} must be finite and real, but {text!r} is {parsed}")
-    parsed = parsed.replace(lambda part: part.is_Pow and part.exp.is_Float, lambda p: p.base ** sp.Rational(p.exp))
-    for power in parsed.atoms(sp.Pow):
-        if power.exp.is_Number and abs(power.exp) > MAX_POWER:
-            raise ValueError(
-                f"powers of {model_name} must be from -{MAX_POWER} to {MAX_POWER}, but {text!r} has {power}"
-            )
-    return parsed
 
 
 def eliminate_common_subexpressions(expressions: Mapping[str, sp.Expr], prefix: str) -> Assignments:

@@ -12,6 +12,7 @@ from functools import cache
 from typing import NamedTuple
 
 from estimator.models.duffing import PARAMETER_DIMENSIONS
+from estimator.models.expression import older_input
 from estimator.models.model import MAX_POWER, Model
 from estimator.support.argument_checks import check_integer, short_repr
 
@@ -31,9 +32,9 @@ class Term(NamedTuple):
 
     @property
     def expression(self) -> str:
-        """Expression of the term, such as ``x1``, ``x1**3``, ``x1**2*x2`` or ``u``; ``1`` for the offset."""
+        """Expression of the term, such as ``x1``, ``x1**3``, ``x1**2*x2`` or ``u[-1]``; ``1`` for the offset."""
         factors = [f"{x}**{n}" if n > 1 else x for x, n in (("x1", self.lag1), ("x2", self.lag2)) if n]
-        factors += [] if self.tap is None else ["u" if self.tap == 0 else f"u{self.tap}"]
+        factors += [] if self.tap is None else [older_input("u", self.tap)]
         return "*".join(factors) or "1"
 
     @property

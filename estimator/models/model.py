@@ -6,31 +6,32 @@ the predictions of a planner and the gradients of an oracle.
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 import keyword
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 
-from estimator.support.argument_checks import check_bool, check_integer, check_mapping, short_repr
+from estimator.models.expression import (
+    FUNCTIONS,
+    check_slopes,
+    names_in,
+    names_in_expression,
+    older_input,
+    parse,
+)
+from estimator.support.argument_checks import check_bool, check_integer, check_mapping, check_number, short_repr
 
 #: Names of inputs, states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
 
-#: Functions that expressions may use.
-FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "tanh", "abs")
-
-#: Functions that generated code imports for these: abs is a builtin of Python, and its derivative is a sign.
-GENERATED_FUNCTIONS = tuple("sign" if name == "abs" else name for name in FUNCTIONS)
-
 #: Highest power in an expression; integer powers are computed as products.
 MAX_POWER = 16
 
-#: Names with another meaning: the sampling step, and functions of generated code.
-RESERVED_NAMES = frozenset({"step", *FUNCTIONS, *GENERATED_FUNCTIONS, "capped", "range"})
+#: Names with another meaning: the sampling step, the number pi, functions, and what generated code uses.
+RESERVED_NAMES = frozenset({"step", "pi", *FUNCTIONS, "capped", "range"})
 
 
 #: The inputs of a model that names none.
@@ -39,41 +40,8 @@ DEFAULT_INPUTS = {"u": ""}
 #: Largest number of samples by which an input of a difference equation may be older than the newest.
 MAX_INPUT_AGE = 2
 
-#: Syntax nodes that an expression may have.
-_ALLOWED_SYNTAX = (
-    ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, ast.Add, ast.Sub, ast.Mult,
-    ast.Div, ast.Pow, ast.USub, ast.UAdd,
-)  # fmt: skip
-
-
-def names_in_expression(text: object, allowed: Collection[str], owner: str) -> set[str]:
-    """The names in an expression, without `FUNCTIONS`.
-
-    Args:
-        text: the expression.
-        allowed: names that it may use.
-        owner: name of the model, for messages.
-
-    Raises:
-        ValueError: naming the text, for a text that is no formula or uses another name.
-    """
-    if not isinstance(text, str) or "__" in text or len(text) > 10_000:
-        raise ValueError(f"expressions of {owner} must be short strings without '__', but one is {text!r:.80}")
-    try:
-        nodes = list(ast.walk(ast.parse(text.strip(), mode="eval")))
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ValueError(f"expressions of {owner} must be formulas, but {text!r} is not one: {error}") from error
-    if not all(isinstance(part, _ALLOWED_SYNTAX) for part in nodes):
-        raise ValueError(
-            f"expressions of {owner} may use + - * / **, brackets and {[*FUNCTIONS]}, but {text!r} uses something else"
-        )
-    used = {part.id for part in nodes if isinstance(part, ast.Name)} - set(FUNCTIONS)
-    unknown = sorted(used.difference(allowed))
-    if unknown:
-        raise ValueError(
-            f"expressions of {owner} may use {sorted(allowed)} and {sorted(FUNCTIONS)}, but {text!r} uses {unknown}"
-        )
-    return used
+#: Fields that came later, with the values at which they are left out of the digest: oracles are named by it.
+_LATER_FIELDS: dict[str, object] = {"inputs": DEFAULT_INPUTS, "constants": {}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +49,12 @@ class Model:
     """The equation of a plant with unknown coefficients.
 
     A model has either ``rates`` (a differential equation; time counts samples) or ``next_state`` (a difference
-    equation). All expressions are strings in the names of states, coefficients and inputs, with ``sin``, ``cos``,
-    ``exp``, ``log``, ``sqrt``, ``tanh`` and ``abs``, whose derivative at 0 counts as 0. In a difference equation the
-    input ``u`` is its newest value, which acts on the next state, and ``u1`` and ``u2`` are its values one and two
-    samples before; likewise for any other input.
+    equation). All expressions are strings in the names of states, coefficients, inputs and constants and ``pi``, with
+    ``sin``, ``cos``, ``tanh``, ``atan``, ``exp``, ``log``, ``sqrt``, ``abs``, ``sign``, ``min``, ``max`` and
+    ``where(condition, a, b)``, whose condition compares two expressions by ``<``, ``<=``, ``>`` or ``>=``. At a jump or
+    a kink a derivative is that of one side; of ``sign`` it is 0, and of ``abs`` at 0 it is 0. In a difference equation
+    the input ``u`` is its newest value, which acts on the next state, and ``u[-1]`` and ``u[-2]`` are its values one
+    and two samples before; likewise for any other input.
 
     Attributes:
         name: name of the model, for messages and generated files.
@@ -103,10 +73,13 @@ class Model:
         physical: parameter of the plant to its expression in coefficients and the sampling ``step`` [s]; may be empty.
         dimensions: parameter to its powers of the input's unit, the displacement's unit and the second.
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
+        constants: name of a number to its value, such as ``{"g": 9.81}``; all expressions may use them.
 
     Raises:
         ValueError: naming the argument, for a name that is not a lower-case identifier or occurs twice, expressions
-            with unknown names, a coefficient without effect, or an output that depends on no state or coefficient.
+            with unknown names or a slope that is not finite where a root or a power is 0
+            (`estimator.models.expression.check_slopes`), a coefficient without effect, or an output that depends on no
+            state or coefficient.
 
     Example:
         >>> from estimator.models.model import Model
@@ -128,11 +101,15 @@ class Model:
     physical: Mapping[str, str] = field(default_factory=dict)
     dimensions: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     inverse: Mapping[str, str] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
+        check_mapping("constants", self.constants)
+        for constant, value in self.constants.items():
+            check_number(f"constants[{constant!r}]", value, -1e30, 1e30)
         for field_name in ("noise", "rates", "next_state"):
             texts = getattr(self, field_name)
             if isinstance(texts, list):  # from JSON
@@ -151,7 +128,7 @@ class Model:
                 raise ValueError(
                     f"dimensions of {field_name} must be three whole numbers, but are {short_repr(powers)}"
                 )
-        names = [*self.states, *self.coefficients, *self.outputs, *self.input_ages]
+        names = [*self.states, *self.coefficients, *self.outputs, *self.inputs, *self.constants]
         for name in (self.name, *names):
             if not _NAME_PATTERN.fullmatch(name) or keyword.iskeyword(name) or name in RESERVED_NAMES:
                 raise ValueError(
@@ -161,7 +138,8 @@ class Model:
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(
-                f"states, coefficients, outputs and inputs must have different names, but share {repeated}; rename one"
+                f"states, coefficients, outputs, inputs and constants must have different names, but share {repeated}; "
+                f"rename one"
             )
         # With x, x_a, a_b and b, the pairs (x, a_b) and (x_a, b) would share the covariance P_x_a_b.
         joined_names = [f"{i}_{j}" for i in self.names for j in self.names]
@@ -198,22 +176,27 @@ class Model:
     def _validate_expressions(self) -> None:
         """Refuse expressions with unknown names, coefficients without effect, and outputs without a state."""
         inputs = tuple(self.input_ages)
-        for texts, known in ((self.physical, self.coefficients), (self.inverse, self.physical)):
+        for texts, mapped in ((self.physical, self.coefficients), (self.inverse, self.physical)):
             for text in texts.values():
-                names_in_expression(text, (*known, "step"), self.name)
-        output_names = [names_in_expression(text, (*self.names, *inputs), self.name) for text in self.outputs.values()]
+                names_in_expression(text, (*mapped, *self.constants, "step"), self.name)
+        known = (*self.names, *self.constants, *inputs)
+        output_names = [names_in_expression(text, known, self.name) for text in self.outputs.values()]
         for sensor, names in zip(self.outputs, output_names, strict=True):
             if names.isdisjoint(self.names):
                 raise ValueError(f"outputs must show a state or a coefficient each, but {sensor!r} shows none")
-        motion_names = [
-            names_in_expression(text, (*self.names, *inputs), self.name) for text in self.update_expressions
-        ]
-        noise_names = [names_in_expression(text, self.names, self.name) for text in self.noise]
+        motion_names = [names_in_expression(text, known, self.name) for text in self.update_expressions]
+        noise_names = [names_in_expression(text, (*self.names, *self.constants), self.name) for text in self.noise]
         unused = sorted(set(self.coefficients).difference(*output_names, *motion_names, *noise_names))
         if unused:
             raise ValueError(
                 f"coefficients must stand in an expression, but {unused} do not; use them, or leave them out"
             )
+        for text in (*self.update_expressions, *self.outputs.values(), *self.noise):
+            check_slopes(text, (*self.states, *inputs), self.constants, self.name)
+
+    def _names_in(self, texts: Iterable[str]) -> set[str]:
+        """The names in expressions that are checked."""
+        return set().union(*(names_in(parse(text, self.name)) for text in texts))
 
     @property
     def is_continuous(self) -> bool:
@@ -254,12 +237,12 @@ class Model:
     def input_ages(self) -> dict[str, tuple[str, int]]:
         """Name of an input's value in expressions, to the input and its age [samples]; the newest has the age 0."""
         ages = range(1 if self.is_continuous else MAX_INPUT_AGE + 1)
-        return {f"{name}{age or ''}": (name, age) for name in self.inputs for age in ages}
+        return {older_input(name, age): (name, age) for name in self.inputs for age in ages}
 
     @cached_property
     def taps(self) -> dict[str, int]:
         """Number of values of each input in a difference equation: 1, or 2 or 3 where it contains older ones."""
-        used = set(re.findall(r"[a-z]\w*", " ".join((*self.update_expressions, *self.outputs.values()))))
+        used = self._names_in((*self.update_expressions, *self.outputs.values()))
         oldest = dict.fromkeys(self.inputs, 0)
         for written, (name, age) in self.input_ages.items():
             oldest[name] = max(oldest[name], age if written in used else 0)
@@ -268,16 +251,15 @@ class Model:
     @cached_property
     def dynamic_names(self) -> tuple[str, ...]:
         """The states and the coefficients that the motion depends on, without coefficients of sensors alone."""
-        used = set(re.findall(r"[a-z]\w*", " ".join(self.update_expressions)))
+        used = self._names_in(self.update_expressions)
         return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits that identify the model."""
-        # The fields alone, without cached properties. Oracles are named by it, so one input `u` adds nothing.
+        # The fields alone, without cached properties.
         values = {one.name: getattr(self, one.name) for one in fields(self)}
-        if dict(self.inputs) == DEFAULT_INPUTS:
-            del values["inputs"]
+        values = {key: v for key, v in values.items() if key not in _LATER_FIELDS or v != _LATER_FIELDS[key]}
         text = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from estimator.models.model import GENERATED_FUNCTIONS, Model
+from estimator.models.expression import GENERATED_FUNCTIONS
+from estimator.models.model import Model
 from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import check_mapping, to_float_array
 from estimator.support.array_types import FloatArray
@@ -117,18 +118,19 @@ def _compiled_map(model: Model, direction: str) -> tuple[Any, Any]:
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic
+        from estimator.engine.expression_parser import parse_expression
 
         known = {name: symbolic.symbol(name) for name in (*names, "step")}
-        expressions = [symbolic.parse_expression(text, known, model.name) for text in mapped.values()]
+        expressions = [parse_expression(text, known, model) for text in mapped.values()]
         slopes = [e.diff(known[name]) for e in expressions for name in names]
         source = ""
         for title, values in (("values", expressions), ("slopes", slopes)):
             lines = symbolic.eliminate_common_subexpressions({f"V_{i}": e for i, e in enumerate(values)}, "CSE")
-            body = "".join(f"    {name} = {printer_numba.print_expression(e)}\n" for name, e in lines)
+            body = "".join(f"    {name} = {printer_numba.print_array_expression(e)}\n" for name, e in lines)
             gathered = ", ".join(f"V_{i}" for i in range(len(values)))
             source += f"def {title}({', '.join([*names, 'step'])}):\n{body}    return ({gathered},)\n"
         return source
 
-    functions = {name: getattr(np, name) for name in GENERATED_FUNCTIONS}
+    functions = {name: getattr(np, {"atan": "arctan"}.get(name, name)) for name in (*GENERATED_FUNCTIONS, "where")}
     code = load_generated(model.name, direction, model.digest, make, functions)
     return code.values, code.slopes

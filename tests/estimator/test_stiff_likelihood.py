@@ -10,7 +10,8 @@ from estimator.inference.record_filter import record_likelihoods
 DECADES = 2.0
 POINTS = 200
 
-OVERFLOW_A, OVERFLOW_B = (f"1.5*({tank} - 10 + abs({tank} - 10))/2" for tank in "ab")
+OVERFLOW_A, OVERFLOW_B = (f"1.5*max({tank} - 10, 0)" for tank in "ab")
+ROOT_A, ROOT_B = (f"({tank}**2 + 1e-9)**(1/4)" for tank in "ab")
 
 
 def in_samples(step, *rates):
@@ -32,8 +33,8 @@ TANKS = Model(
     "tanks", {"a": "1", "b": "1"}, {"ku": "1", "ka": "1", "ea": "1", "kb": "1", "kc": "1", "ov": "1"},
     noise=("1", "1"), outputs={"y": "b"},
     rates=in_samples(
-        4.0, f"ku*u - ka*sqrt(abs(a)) + ea - ea*a - {OVERFLOW_A}",
-        f"kb*sqrt(abs(a)) - kc*sqrt(abs(b)) + ov*{OVERFLOW_A} - {OVERFLOW_B}",
+        4.0, f"ku*u - ka*{ROOT_A} + ea - ea*a - {OVERFLOW_A}",
+        f"kb*{ROOT_A} - kc*{ROOT_B} + ov*{OVERFLOW_A} - {OVERFLOW_B}",
     ),
 )  # fmt: skip
 

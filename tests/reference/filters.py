@@ -8,13 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
+from estimator.models.expression import evaluate, parse
+
 EPS = np.finfo(float).eps
 _STEP = 1e-30
-_FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
+
+
+def where(comparison, left, right, first, second):
+    """The first value where a comparison of the real parts holds, else the second."""
+    order = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[comparison]
+    return np.where(order(np.real(left), np.real(right)), first, second)
+
+
+#: Functions of the language, for real numbers and for complex steps.
+FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")} | {
+    "atan": np.arctan,
+    "abs": lambda x: np.sign(np.real(x)) * x,
+    "sign": lambda x: np.sign(np.real(x)),
+    "min": lambda *values: reduce(lambda a, b: where("<", b, a, b, a), values),
+    "max": lambda *values: reduce(lambda a, b: where(">", b, a, b, a), values),
+    "where": where,
+}
 
 
 @dataclass(frozen=True)
@@ -43,11 +62,11 @@ class Plant:
         """The plant of a declaration's strings, whose process noise is white."""
 
         def evaluated(texts, z, c, **inputs):
-            names = dict(zip(model.names, [*z, *c], strict=True)) | inputs | _FUNCTIONS
-            return [eval(text, {"__builtins__": {}}, names) for text in texts]
+            names = dict(zip(model.names, [*z, *c], strict=True)) | inputs | {"pi": np.pi, **model.constants}
+            return [evaluate(parse(text, model.name), names, FUNCTIONS) for text in texts]
 
         def move(z, c, u):
-            inputs = {"u": u} if model.is_continuous else dict(zip(("u", "u1", "u2"), u, strict=False))
+            inputs = {"u": u} if model.is_continuous else dict(zip(("u", "u[-1]", "u[-2]"), u, strict=False))
             return evaluated(model.update_expressions, z, c, **inputs)
 
         return cls(

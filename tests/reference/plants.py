@@ -21,7 +21,7 @@ DRAG = Model(
     name="drag",
     states={"x": "V", "v": "V"},
     coefficients={"stiffness": "1", "drag": "1", "gain": "1"},
-    rates=("v", "gain*u - stiffness*x - drag*v*sqrt(v**2)"),
+    rates=("v", "gain*u - stiffness*x - drag*v*abs(v)"),
     noise=("0", "sqrt(3)"),
     outputs={"y": "x"},
     substeps=4,
@@ -32,7 +32,7 @@ TANKS = Model(
     name="tanks",
     states={"upper": "m", "lower": "m"},
     coefficients={"flow": "1", "leak": "1", "valve": "1", "bias": "m"},
-    next_state=("upper - flow*tanh(upper) + valve*(u + 0.5*u1)", "lower + flow*tanh(upper) - leak*tanh(lower)"),
+    next_state=("upper - flow*tanh(upper) + valve*(u + 0.5*u[-1])", "lower + flow*tanh(upper) - leak*tanh(lower)"),
     noise=("1", "0.5"),
     outputs={"level": "lower + bias", "top": "upper + 0.1*u"},
 )
