@@ -34,8 +34,8 @@ class OnlineEstimator:
     which inputs act on y_t, and how. The prior is the belief one sample before the first.
 
     Args:
-        model: `difference`, the paper's difference equation and the default; `duffing`, the physical equation; or any
-            other `Model`.
+        model: `difference`, `duffing`, or any other `Model` with time in samples. The default is the prior's, or
+            `difference`, the paper's difference equation, without a prior.
         prior: a `Belief` of the model before the first sample. The default is `silverbox_prior` for the paper's model
             and `recorded_prior` for other difference equations and for `duffing`; other models need a prior.
         rig: timing and interpolation of the inputs, or the name of a rig file. The default is a linear input between
@@ -102,7 +102,7 @@ class OnlineEstimator:
             noise_hypotheses = (7, 7) if rig_brings_prior else 1
         if not isinstance(model, Model | None):
             raise ValueError(f"model must be a Model, but is {model!r:.60}; use difference() or duffing()")
-        self.model = difference() if model is None else model
+        self.model = model or (prior.model if isinstance(prior, Belief) else difference())
         if iterations is None:
             iterations = DEFAULT_ITERATIONS["mean_field" if factorisation == "mean_field" else "structured"]
         self.settings = checked_settings(

@@ -63,7 +63,9 @@ def hook_source(spec: KernelSpec, loop: Any) -> str:
     source_text += loop(
         "step_true", "The true plant moves.", *propagate_state(model, spec.degree, true), *substep_arguments
     )
-    output_expression = differentiate(model).outputs[0].subs({symbol(name): 0 for name in model.input_ages})
+    output_expression = (
+        differentiate(model).outputs[0].subs({symbol(name): 0 for name in (*model.input_ages, *model.acting_inputs)})
+    )
     believed_output, true_output = (substitute([("", output_expression)], names)[0][1] for names in (believed, true))
     lines = [
         ("E_d", symbol("SUM_SQUARED_DIFFERENCE") + (believed_output - true_output) ** 2),

@@ -17,6 +17,7 @@ from estimator.belief import Belief
 from estimator.models import MODELS
 from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
+from estimator.rigs.stated_units import model_near_one
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import check_choice, check_number, short_repr
 from estimator.support.array_types import FloatArray
@@ -66,16 +67,27 @@ class ModelExperiment(SimulatedExperiment):
     def plant(self) -> Model:
         """The model."""
         system = self.system
-        if isinstance(system, Model):
-            return system
         if isinstance(system, str):
             check_choice("system", system, MODELS)
             return MODELS[system]()
+        if isinstance(system, Model):
+            return self._in_samples(system)
         if not isinstance(system, Mapping) or not set(system) <= set(Model.__dataclass_fields__):
             raise ValueError(
                 f"system must be one of {list(MODELS)}, a Model or its fields, but is {short_repr(system)}"
             )
-        return Model(**system)
+        return self._in_samples(Model(**system))
+
+    def _in_samples(self, model: Model) -> Model:
+        """The model itself, or of one in seconds the model in samples, with states in parts of the limits."""
+        if model.time == "sample":
+            return model
+        names = parameter_names(model)
+        mean = (
+            self.mean if isinstance(self.mean, Mapping) and set(self.mean) == set(names) else dict.fromkeys(names, 1.0)
+        )
+        limits = dict.fromkeys(list(model.outputs)[:1], self.max_output) | dict.fromkeys(model.inputs, self.max_input)
+        return model_near_one(model, Scales(self.step), mean, limits)
 
     @property
     def model(self) -> Model:
@@ -178,7 +190,7 @@ class ModelEnv(DuffingEnv):
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
-    | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, or a dict of its fields |
+    | ``system`` | | a name of `estimator.models.MODELS`, a `Model`, also in seconds, or a dict of its fields |
     | ``mean`` | | parameter to its mean, or without ``std`` to the middle of its range |
     | ``std`` | None | parameter to its standard deviation: Gaussian; None: log-uniform within ``spread`` |
     | ``plant_spread`` | ``spread`` | as in `DuffingEnv`; with ``std`` it may only be 0 |

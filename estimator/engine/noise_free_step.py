@@ -113,7 +113,8 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     )
     source += variational_rk4.print_integrator(model, degree, layout, lanes, input_values=input_values)
     source += _step_source(model, degree, lag, loop)
-    constant_input = {symbol(written): symbol(i) for written, (i, _) in model.input_ages.items()}
+    constant_input: dict[Any, Any] = {symbol(written): symbol(i) for written, (i, _) in model.input_ages.items()}
+    constant_input |= {symbol(written): symbolic.ZERO for written, (_, order) in model.acting_inputs.items() if order}
     summed = {
         f"SUM_{c}": sum(m.diff(symbol(c)) for m in derivatives.moves).xreplace(constant_input)
         for c in model.coefficients
@@ -122,7 +123,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
         symbolic.eliminate_common_subexpressions(summed, "CSE"), {i: input_history_row(i, 0) for i in model.inputs}
     )
     source += loop("regressors", "The regressors.", lines, {f"REGRESSOR_{c}": f"SUM_{c}" for c in model.coefficients})
-    rest = {symbol(name): 0 for name in (*model.states, *model.input_ages)}
+    rest = {symbol(name): 0 for name in (*model.states, *model.input_ages, *model.acting_inputs)}
     slopes = {
         f"SLOPE_{i}_{j}": slope.subs(rest)
         for i, row in zip(model.states, derivatives.jacobian, strict=True)
@@ -130,7 +131,7 @@ def _source(model: Model, degree: int, lag: int, lanes: int, layout: Mapping[str
     }
     results = {f"A_{name.removeprefix('SLOPE_')}": name for name in slopes}
     source += loop("linearise", "The linear part.", list(slopes.items()), results)
-    mirrored = {symbol(name): -symbol(name) for name in (*model.states, *model.input_ages)}
+    mirrored = {symbol(name): -symbol(name) for name in (*model.states, *model.input_ages, *model.acting_inputs)}
     is_odd = all((e + e.xreplace(mirrored)).expand() == 0 for e in (*derivatives.moves, *derivatives.outputs))
     return source + f"IS_ODD = {is_odd}\n"
 
@@ -179,8 +180,9 @@ def _output_velocity_and_gain(model: Model) -> tuple[Any, Any, Any]:
 
     derivatives, u = differentiate(model), symbol("u")
     constant_input = {symbol(written): u for written in model.input_ages}
+    constant_input |= {symbol(written): sp.S.Zero for written, (_, order) in model.acting_inputs.items() if order}
     moves = dict(zip(map(symbol, model.states), (m.xreplace(constant_input) for m in derivatives.moves), strict=True))
-    shown = derivatives.outputs[0].xreplace({u: sp.S.Zero})
+    shown = derivatives.outputs[0].xreplace({**constant_input, u: sp.S.Zero})
 
     def later(value: Any) -> Any:
         """The time derivative, or the value one sample later."""

@@ -52,6 +52,17 @@ def stage_input(name: str, tag: str) -> str:
     return f"U_AT_{name}_{tag}"
 
 
+def stage_input_rate(name: str, tag: str) -> str:
+    """The name of an input's time derivative at a stage of a Runge-Kutta step, per sample."""
+    return f"U_RATE_AT_{name}_{tag}"
+
+
+def stage_inputs(model: Model, tag: str) -> dict[str, str]:
+    """What a differential equation uses of its inputs to its name at a stage of a Runge-Kutta step."""
+    names = (stage_input, stage_input_rate)
+    return {written: names[order](name, tag) for written, (name, order) in model.acting_inputs.items()}
+
+
 def input_history_row(name: str, age: int) -> str:
     """The row of an input's value of an age, 0 to 2 samples, where a block keeps the last values themselves."""
     return f"{('INPUT', 'LAST_INPUT', 'OLDER_INPUT')[age]}_{name}"

@@ -22,7 +22,7 @@ from functools import cache
 import sympy as sp
 
 from estimator.engine.expression_parser import parse_expression
-from estimator.engine.storage_layout import input_row, integrator_rows, stage_input
+from estimator.engine.storage_layout import input_row, integrator_rows, stage_input, stage_input_rate, stage_inputs
 from estimator.models.model import Model
 
 Assignments = list[tuple[str, sp.Expr]]
@@ -96,9 +96,15 @@ def differentiate(model: Model) -> ModelDerivatives:
     """Parse and differentiate a model.
 
     Raises:
-        ValueError: for text that is not an expression, or has a name that is not the model's.
+        ValueError: for text that is not an expression, or has a name that is not the model's; and for a model with time
+            in seconds.
     """
-    symbols = {name: symbol(name) for name in (*model.names, *model.input_ages)}
+    if model.time != "sample":
+        raise ValueError(
+            f"model must count time in samples here, but {model.name!r} counts seconds; make a prior by "
+            f"estimator.rigs.stated_units.prior_in_units, whose model does"
+        )
+    symbols = {name: symbol(name) for name in (*model.names, *model.input_ages, *model.acting_inputs)}
     moves = tuple(parse_expression(text, symbols, model) for text in model.update_expressions)
     without_input = {name: symbols[name] for name in model.names}
     noise = tuple(parse_expression(text, without_input, model) for text in model.noise)
@@ -187,7 +193,7 @@ def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
 def runge_kutta_4(
     variables: Sequence[str],
     rate_assignments: Assignments,
-    inputs: Iterable[str],
+    model: Model,
     substeps: int,
     sample_length: sp.Expr = sp.S.One,
 ) -> Assignments:
@@ -198,7 +204,7 @@ def runge_kutta_4(
     Args:
         variables: names that are integrated.
         rate_assignments: assignments of their rates ``RATE_<name>`` in the names and the inputs.
-        inputs: names of the inputs, whose values at the stages `input_at_stages` assigns.
+        model: the equation, for the names of its inputs, whose values at the stages `input_at_stages` assigns.
         substeps: steps per sample.
         sample_length: length of the sample, in sampling steps.
     """
@@ -207,7 +213,7 @@ def runge_kutta_4(
     rates: list[dict[str, sp.Expr]] = []
     for k, fraction in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
         tag = "ABCD"[k]
-        at: dict[str, sp.Expr | str] = {i: stage_input(i, tag if k != 2 else "B") for i in inputs}
+        at: dict[str, sp.Expr | str] = {**stage_inputs(model, tag if k != 2 else "B")}
         for name in variables:
             if k:
                 lines.append((f"{name}_{tag}", symbol(name) + fraction * h * rates[-1][name]))
@@ -231,7 +237,12 @@ def runge_kutta_4(
 
 
 def input_at_stages(model: Model, degree: int, substeps: int) -> Assignments:
-    """`stage_input` of each input and tag: its value at the start, middle and end of a Runge-Kutta step."""
+    """`stage_inputs` at the start, middle and end of a Runge-Kutta step.
+
+    Raises:
+        ValueError: for a model with the derivative of an input that is held (degree 0).
+    """
+    check_input_is_continuous(model, degree)
     h = sp.Rational(1, substeps)
     lines = []
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
@@ -242,7 +253,27 @@ def input_at_stages(model: Model, degree: int, substeps: int) -> Assignments:
             for k in range(degree - 1, -1, -1):
                 value = symbol(input_row(i, k)) + symbol(f"TAU_{tag}") * value
             lines.append((stage_input(i, tag), value))
+        for i, order in model.acting_inputs.values():
+            if order:
+                value = sp.S.Zero
+                for k in range(degree, 0, -1):
+                    value = k * symbol(input_row(i, k)) + symbol(f"TAU_{tag}") * value
+                lines.append((stage_input_rate(i, tag), value))
     return lines
+
+
+def check_input_is_continuous(model: Model, degree: int) -> None:
+    """Refuse the derivative of an input that jumps from sample to sample.
+
+    Raises:
+        ValueError: with the remedy.
+    """
+    derivatives = [written for written, (_, order) in model.acting_inputs.items() if order]
+    if derivatives and degree == 0:
+        raise ValueError(
+            f"interpolation must be 'linear', 'look_ahead' or 'spline' for {model.name}, which uses {derivatives[0]}, "
+            f"but is 'zero_order': a held input has no derivative where it jumps"
+        )
 
 
 def state_rk4_step(model: Model, degree: int) -> Assignments:
@@ -250,7 +281,7 @@ def state_rk4_step(model: Model, degree: int) -> Assignments:
     at = {symbol(i): symbol(f"M_{i}") for i in model.states}
     rates = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
     stages = runge_kutta_4(
-        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model.inputs, model.substeps
+        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model, model.substeps
     )
     return input_at_stages(model, degree, model.substeps) + stages
 

@@ -19,7 +19,7 @@ from typing import Any
 import sympy as sp
 
 from estimator.engine import printer_numba, symbolic
-from estimator.engine.storage_layout import integrator_rows, stage_input, upper_triangle_names
+from estimator.engine.storage_layout import integrator_rows, stage_inputs, upper_triangle_names
 from estimator.engine.symbolic import (
     Assignments,
     Program,
@@ -88,7 +88,7 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
     lines = Program(
         input_at_stages(model, degree, model.substeps)
-        + runge_kutta_4(plain_variables, stage, model.inputs, model.substeps, sample_length)
+        + runge_kutta_4(plain_variables, stage, model, model.substeps, sample_length)
     )
     total: _Slopes = dict.fromkeys(slopes, sp.S.Zero)
     stage_slopes: _Slopes = {}
@@ -129,7 +129,7 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.dynamic_names) for a, i in enumerate(states)}
     if model.held:
         slopes |= {(i, _HELD_NOISE): noise[a] for a, i in enumerate(states)}
-    changing = {*map(symbol, model.inputs), *at.values()}
+    changing = {*map(symbol, model.acting_inputs), *at.values()}
     named |= {f"J_{i}_{j}": slope for (i, j), slope in slopes.items() if slope.free_symbols & changing}
     for a in range(n):
         for b in range(a, 0 if model.held else n):
@@ -219,7 +219,9 @@ def _slopes_at(model: Model, tag: str, point: Mapping[str, sp.Expr], lines: Prog
     stage, slopes = _stage_rates_and_slopes(model)
     stage = [(name, value) for name, value in stage if not name.startswith("RATE_")]
     tagged = {name: f"{name}_{tag}" for name, _ in stage}
-    values_at = {f"M_{i}": value for i, value in point.items()} | {u: symbol(stage_input(u, tag)) for u in model.inputs}
+    values_at = {f"M_{i}": value for i, value in point.items()} | {
+        u: symbol(value) for u, value in stage_inputs(model, tag).items()
+    }
     lines += symbolic.substitute(stage, {**tagged, **values_at})
     named = [("", symbol(f"J_{i}_{j}") if f"J_{i}_{j}" in tagged else value) for (i, j), value in slopes.items()]
     return dict(zip(slopes, (value for _, value in symbolic.substitute(named, {**tagged, **values_at})), strict=True))

@@ -16,13 +16,21 @@ from functools import cached_property
 
 from estimator.models.expression import (
     FUNCTIONS,
-    check_slopes,
+    input_derivative,
     names_in,
     names_in_expression,
     older_input,
     parse,
 )
-from estimator.support.argument_checks import check_bool, check_integer, check_mapping, check_number, short_repr
+from estimator.models.finite_slopes import check_slopes
+from estimator.support.argument_checks import (
+    check_bool,
+    check_choice,
+    check_integer,
+    check_mapping,
+    check_number,
+    short_repr,
+)
 
 #: Names of inputs, states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
@@ -41,20 +49,20 @@ DEFAULT_INPUTS = {"u": ""}
 MAX_INPUT_AGE = 2
 
 #: Fields that came later, with the values at which they are left out of the digest: oracles are named by it.
-_LATER_FIELDS: dict[str, object] = {"inputs": DEFAULT_INPUTS, "constants": {}}
+_LATER_FIELDS: dict[str, object] = {"inputs": DEFAULT_INPUTS, "constants": {}, "time": "sample"}
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """The equation of a plant with unknown coefficients.
 
-    A model has either ``rates`` (a differential equation; time counts samples) or ``next_state`` (a difference
-    equation). All expressions are strings in the names of states, coefficients, inputs and constants and ``pi``, with
-    ``sin``, ``cos``, ``tanh``, ``atan``, ``exp``, ``log``, ``sqrt``, ``abs``, ``sign``, ``min``, ``max`` and
-    ``where(condition, a, b)``, whose condition compares two expressions by ``<``, ``<=``, ``>`` or ``>=``. At a jump or
-    a kink a derivative is that of one side; of ``sign`` it is 0, and of ``abs`` at 0 it is 0. In a difference equation
-    the input ``u`` is its newest value, which acts on the next state, and ``u[-1]`` and ``u[-2]`` are its values one
-    and two samples before; likewise for any other input.
+    A model has either ``rates`` (a differential equation) or ``next_state`` (a difference equation). All expressions
+    are strings in the names of states, coefficients, inputs and constants and ``pi``, with ``sin``, ``cos``, ``tanh``,
+    ``atan``, ``exp``, ``log``, ``sqrt``, ``abs``, ``sign``, ``min``, ``max`` and ``where(condition, a, b)``, whose
+    condition compares two expressions by ``<``, ``<=``, ``>`` or ``>=``. At a jump or a kink a derivative is that of
+    one side; of ``sign`` it is 0, and of ``abs`` at 0 it is 0. In a difference equation the input ``u`` is its newest
+    value, which acts on the next state, and ``u[-1]`` and ``u[-2]`` are its values one and two samples before. In a
+    differential equation ``derivative(u)`` is its time derivative, where an interpolation makes it continuous.
 
     Attributes:
         name: name of the model, for messages and generated files.
@@ -71,15 +79,19 @@ class Model:
         substeps: Runge-Kutta steps of order 4 per sample, enough that the integration error stays below a tenth of the
             standard deviation after a long record.
         physical: parameter of the plant to its expression in coefficients and the sampling ``step`` [s]; may be empty.
-        dimensions: parameter to its powers of the input's unit, the displacement's unit and the second.
+        dimensions: parameter to its powers of the input's unit, the displacement's unit and the second, for scaled
+            coefficients; or to its unit, where ``physical`` gives the numbers in it.
         inverse: coefficient to its expression in the parameters and ``step``; all of them, where ``physical`` is given.
         constants: name of a number to its value, such as ``{"g": 9.81}``; all expressions may use them.
+        time: unit of time in rates and noise: ``sample``; or ``s``, where all numbers are in the stated units, and the
+            noise is the root of a white intensity per second. `estimator.rigs.stated_units` makes a prior and a scaled
+            model of it.
 
     Raises:
         ValueError: naming the argument, for a name that is not a lower-case identifier or occurs twice, expressions
             with unknown names or a slope that is not finite where a root or a power is 0
-            (`estimator.models.expression.check_slopes`), a coefficient without effect, or an output that depends on no
-            state or coefficient.
+            (`estimator.models.finite_slopes.check_slopes`), a coefficient without effect, or an output that depends on
+            no state or coefficient.
 
     Example:
         >>> from estimator.models.model import Model
@@ -99,14 +111,18 @@ class Model:
     held: bool = False
     substeps: int = 1
     physical: Mapping[str, str] = field(default_factory=dict)
-    dimensions: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
+    dimensions: Mapping[str, tuple[int, int, int] | str] = field(default_factory=dict)
     inverse: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
+    time: str = "sample"
 
     def __post_init__(self) -> None:
         for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
+        check_choice("time", self.time, ("sample", "s"))
+        if self.time == "s" and self.next_state:
+            raise ValueError("time must be 'sample' for a difference equation, but is 's'; leave it out")
         check_mapping("constants", self.constants)
         for constant, value in self.constants.items():
             check_number(f"constants[{constant!r}]", value, -1e30, 1e30)
@@ -124,6 +140,13 @@ class Model:
         check_bool("held", self.held)
         check_integer("substeps", self.substeps, 1000)
         for field_name, powers in self.dimensions.items():
+            if isinstance(powers, str):
+                continue
+            if self.time == "s":
+                raise ValueError(
+                    f"dimensions of {field_name} must be a unit such as 'kg' where time is in seconds, but are "
+                    f"{short_repr(powers)}"
+                )
             if len(powers) != 3 or not all(type(power) is int and abs(power) < 100 for power in powers):
                 raise ValueError(
                     f"dimensions of {field_name} must be three whole numbers, but are {short_repr(powers)}"
@@ -175,7 +198,7 @@ class Model:
 
     def _validate_expressions(self) -> None:
         """Refuse expressions with unknown names, coefficients without effect, and outputs without a state."""
-        inputs = tuple(self.input_ages)
+        inputs = (*self.input_ages, *(input_derivative(name) for name in self.inputs if self.is_continuous))
         for texts, mapped in ((self.physical, self.coefficients), (self.inverse, self.physical)):
             for text in texts.values():
                 names_in_expression(text, (*mapped, *self.constants, "step"), self.name)
@@ -238,6 +261,16 @@ class Model:
         """Name of an input's value in expressions, to the input and its age [samples]; the newest has the age 0."""
         ages = range(1 if self.is_continuous else MAX_INPUT_AGE + 1)
         return {older_input(name, age): (name, age) for name in self.inputs for age in ages}
+
+    @cached_property
+    def acting_inputs(self) -> dict[str, tuple[str, int]]:
+        """What a differential equation uses of its inputs: name in expressions to the input and its order.
+
+        The inputs themselves have the order 0; the time derivatives that expressions contain have the order 1.
+        """
+        used = self._names_in((*self.update_expressions, *self.outputs.values()))
+        derivatives = {input_derivative(name): (name, 1) for name in self.inputs if input_derivative(name) in used}
+        return {name: (name, 0) for name in self.inputs} | derivatives
 
     @cached_property
     def taps(self) -> dict[str, int]:

@@ -130,12 +130,19 @@ class Scales:
         """Scale X of the displacement, in the unit of the output times seconds to the order."""
         return float(self.output * self.step**self.order)
 
-    def factor(self, dimension: UnitPowers) -> float:
-        """Factor from scaled to physical numbers, for a quantity with the given powers whose time is in seconds."""
+    def factor(self, dimension: UnitPowers | str) -> float:
+        """Factor from scaled to physical numbers, for a quantity with the given powers whose time is in seconds.
+
+        It is 1 for a unit instead of powers: the numbers are then in that unit.
+        """
+        if isinstance(dimension, str):
+            return 1.0
         return float(self.input ** dimension[0] * self.displacement ** dimension[1])
 
-    def unit(self, dimension: UnitPowers) -> str:
+    def unit(self, dimension: UnitPowers | str) -> str:
         """Unit of a quantity with the given powers, in the units of the channels; ``"1"`` for a pure number."""
+        if isinstance(dimension, str):
+            return dimension
         powers: dict[str, int] = {}
         displacement = _parse_unit(self.output_unit)
         displacement["s"] = displacement.get("s", 0) + self.order

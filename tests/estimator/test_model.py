@@ -25,7 +25,7 @@ TANK = {
     [
         (
             {"rates": ("u - leak*x",)},
-            "may use ['loss', 'u', 'x'] and ['abs', 'atan', 'cos', 'exp', 'log', 'max', 'min', 'sign'",
+            "may use ['derivative(u)', 'loss', 'u', 'x'] and ['abs', 'atan', 'cos', 'exp', 'log', 'max', 'min', 'sign'",
         ),
         ({"rates": ("u - loss*x*u[-1]",)}, "uses ['u[-1]']"),
         ({"rates": ("u - loss*x//2",)}, "may use + - * / **, brackets and ['sin', 'cos'"),

@@ -7,6 +7,7 @@ import pytest
 from reference.filters import FUNCTIONS, Plant, central, jacobian
 from tables import table
 
+from estimator import OnlineEstimator, Rig
 from estimator.compilation.simd import LANES
 from estimator.engine import printer_numba
 from estimator.engine.expression_parser import parse_expression
@@ -18,6 +19,7 @@ from estimator.models.difference_equation import difference
 from estimator.models.expression import evaluate, parse
 from estimator.models.model import Model
 from estimator.models.pendulum import PENDULUM
+from estimator.priors import weak_prior
 from estimator.rigs.physical_parameters import coefficients_of, to_physical
 from estimator.rigs.units import Scales
 
@@ -203,3 +205,51 @@ def test_constants_and_choices_stand_in_physical_parameters():
     found = coefficients_of(model, {"length": lengths}, Scales(0.1))
     np.testing.assert_allclose(found[:, 0], 0.981 / lengths)
     np.testing.assert_allclose(to_physical(model, found, Scales(0.1))[:, 0], lengths)
+
+
+#: An input that acts by its slope, and a sensor that shows it.
+FOLLOWER = Model(
+    "follower", {"x": "1"}, {"k": "1"}, ("1",), {"y": "x + 0.1*derivative(u)"}, substeps=2,
+    rates=("derivative(u) - k*x",), inputs={"u": "1"},
+)  # fmt: skip
+
+
+def test_the_derivative_of_a_linear_input_is_its_slope():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(30)
+    state, k, shown, h = 0.2, 0.3, [], 0.5
+    for slope in np.diff(u, prepend=0.0):
+        for _ in range(2):
+            rate = lambda x, slope=slope: slope - k * x  # noqa: E731
+            k1 = rate(state)
+            k2 = rate(state + h / 2 * k1)
+            k3 = rate(state + h / 2 * k2)
+            k4 = rate(state + h * k3)
+            state += h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        shown.append(state + 0.1 * slope)
+    found = free_run(FOLLOWER, [k], u, [0.2], interpolation="linear")
+    np.testing.assert_allclose(found, shown, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "spline"])
+def test_a_coefficient_is_learned_under_a_derivative(interpolation):
+    rng = np.random.default_rng(0)
+    times = np.arange(400)
+    u = np.sin(0.3 * times) + np.sin(0.11 * times)
+    y = free_run(FOLLOWER, [0.3], u, interpolation="linear") + 1e-2 * rng.standard_normal(400)
+    prior = weak_prior(FOLLOWER, [0.2], [[0.1**2]], process_noise=1e-3, measurement_noise=1e-2)
+    estimator = OnlineEstimator(FOLLOWER, prior, Rig(prior.step, interpolation))
+    estimator.run(u, y)
+    mean, std = estimator.belief.coefficients()["k"]
+    assert std < 0.02
+    # The record is of a linear input; a spline has another slope at a sample.
+    assert abs(mean - 0.3) < (4 * std if interpolation == "linear" else 0.1)
+
+
+def test_a_held_input_has_no_derivative():
+    with pytest.raises(
+        ValueError, match=re.escape("interpolation must be 'linear', 'look_ahead' or 'spline' for foll")
+    ):
+        free_run(FOLLOWER, [0.3], np.ones(4))
+    with pytest.raises(ValueError, match=re.escape("uses ['derivative(u)']")):
+        Model("late", {"x": "1"}, {"k": "1"}, ("1",), {"y": "x"}, next_state=("k*x + derivative(u)",))
