@@ -30,6 +30,9 @@ _LOG_LEAP_LENGTH = 0.5 * np.log(10.0)
 #: Longest leap [standard deviations].
 _MAX_LEAP_STDS = 1e9
 
+#: Bisections of the length of a leap, which reach the rounding error.
+_N_BISECTIONS = 50
+
 #: Factors of the noise ratio that are tried after a leap.
 _LEAP_RATIO_FACTORS = (1.0, 0.1, 0.01)
 
@@ -63,7 +66,7 @@ def fit_leaps(
         Index of a parameter to its fits, and whether they contradict a Gaussian about the start.
     """
     begin, values, slopes = start.mean[0], parameter_map.values(start.mean)[0], parameter_map.slopes(start.mean)[0]
-    leaps = list[tuple[int, float, FloatArray]]()
+    leaps = list[tuple[int, float, float, FloatArray]]()
     for number in parameter_indices.tolist():
         toward = start.cov[0] @ slopes[number]
         std = float(np.sqrt(slopes[number] @ toward))
@@ -71,13 +74,14 @@ def fit_leaps(
             continue
         first, unit = np.arcsinh(values[number] / std), toward / std
         for side in (1.0, -1.0):
-            near = [values[number] + side * far * std for far in _LEAP_STDS]
-            for target in [*near, *(std * np.sinh(first + side * _LOG_LEAP_LENGTH * np.arange(1, _N_LOG_LEAPS + 1)))]:
-                length = _length_to_target(parameter_map, number, begin, side * unit, side, float(target))
-                leaps.append((number, length, begin + side * length * unit))
+            short = [values[number] + side * length * std for length in _LEAP_STDS]
+            long = std * np.sinh(first + side * _LOG_LEAP_LENGTH * np.arange(1, _N_LOG_LEAPS + 1))
+            leaps += [(number, side, target, side * unit) for target in (*short, *long.tolist())]
     if not leaps:
         return {}, False
-    leap_parameters, lengths, points = (np.array(part) for part in zip(*leaps, strict=True))
+    leap_parameters, sides, targets, directions = (np.array(part) for part in zip(*leaps, strict=True))
+    lengths = _lengths_to_targets(parameter_map, leap_parameters, begin, directions, sides, targets)
+    points = begin + lengths[:, None] * directions
     gradients = parameter_map.slopes(points)[np.arange(len(points)), leap_parameters]
     for factors, iterations, allowed in (
         (_LEAP_RATIO_FACTORS[1:2], SCREENING_ITERATIONS, _MAX_SCREENING_LOSS),
@@ -103,34 +107,37 @@ def fit_leaps(
     return fits_by_parameter, is_surprising
 
 
-def _length_to_target(
+def _lengths_to_targets(
     parameter_map: ParameterMap,
-    parameter_index: int,
+    parameter_indices: npt.NDArray[np.intp],
     begin: FloatArray,
-    direction_vector: FloatArray,
-    sign: float,
-    target: float,
-) -> float:
-    """The length along a direction at which a parameter reaches a target, or the last before the parameter jumps.
+    directions: FloatArray,
+    signs: FloatArray,
+    targets: FloatArray,
+) -> FloatArray:
+    """(n,) lengths along directions at which a parameter reaches its target, or the last before the parameter jumps.
 
     Args:
         parameter_map: from coefficients to parameters.
-        parameter_index: index of the parameter.
+        parameter_indices: (n,) index of the parameter of each direction.
         begin: (K,) coefficients at length 0.
-        direction_vector: (K,) change of the coefficients per length.
-        sign: 1 where the target is above the begin, -1 where below.
-        target: value of the parameter.
+        directions: (n, K) change of the coefficients per length.
+        signs: (n,) 1 where the target is above the begin, -1 where below.
+        targets: (n,) values of the parameters.
     """
-    first = float(parameter_map.values(begin[None])[0, parameter_index])
+    rows = np.arange(len(targets))
+    first = parameter_map.values(begin[None])[0, parameter_indices]
 
-    def is_past(length: float) -> bool:
-        value = float(parameter_map.values((begin + length * direction_vector)[None])[0, parameter_index])
-        return not 0 < sign * (value - first) < sign * (target - first)
+    def is_past(lengths: FloatArray) -> npt.NDArray[np.bool_]:
+        values = parameter_map.values(begin + lengths[:, None] * directions)[rows, parameter_indices]
+        change = signs * (values - first)
+        return np.asarray(~((change > 0) & (change < signs * (targets - first))))
 
-    near, far = 0.0, 1.0
-    while not is_past(far) and far < _MAX_LEAP_STDS:
-        far *= 2
-    for _ in range(50):
+    near, far = np.zeros(len(targets)), np.ones(len(targets))
+    while (is_short := ~is_past(far) & (far < _MAX_LEAP_STDS)).any():
+        far[is_short] *= 2
+    for _ in range(_N_BISECTIONS):
         middle = (near + far) / 2
-        near, far = (near, middle) if is_past(middle) else (middle, far)
+        past = is_past(middle)
+        near, far = np.where(past, near, middle), np.where(past, middle, far)
     return near

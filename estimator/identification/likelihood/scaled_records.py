@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -106,15 +106,7 @@ class ScaledRecords:
     @cached_property
     def model(self) -> Model:
         """The rig's model with the optional terms."""
-        terms = {name: name in self.optional_terms for name in OPTIONAL_TERMS}
-        model = duffing(
-            offsets=True,
-            sensor=self.rig.output.kind,
-            cubic_damping=terms["cubic_damping"],
-            quintic=terms["quintic"],
-            dry_friction=terms["dry_friction"],
-        )
-        return replace(model, substeps=self.substeps)
+        return _duffing_with_terms(self.rig.output.kind, self.optional_terms, self.substeps)
 
     @property
     def belief_model(self) -> Model:
@@ -306,3 +298,17 @@ class ScaledRecords:
         # The records do not determine the speed below which friction fades: it is a small part of the usual speed.
         creep = _CREEP_SPEED_FRACTION * self.mean_frequency * self.displacement
         return [(0.0, self.natural_coefficient_sizes()["friction"]), (creep, 0.01 * creep)]
+
+
+@cache
+def _duffing_with_terms(sensor: str, optional_terms: tuple[str, ...], substeps: int) -> Model:
+    """Eq. (1) with offsets and optional terms; cached, because the search makes problems by the dozen."""
+    terms = {name: name in optional_terms for name in OPTIONAL_TERMS}
+    model = duffing(
+        offsets=True,
+        sensor=sensor,
+        cubic_damping=terms["cubic_damping"],
+        quintic=terms["quintic"],
+        dry_friction=terms["dry_friction"],
+    )
+    return replace(model, substeps=substeps)
