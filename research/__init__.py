@@ -1,1 +1,1 @@
-"""How we know: the search for oracles, certificates, studies and the paper's experiment. Not installed."""
+"""The search for oracles, certificates, studies and the paper's experiment. The wheel does not contain this package."""

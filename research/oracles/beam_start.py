@@ -1,4 +1,4 @@
-"""A start of the oracle's search for a known system: the best path through the grid of its states, over an episode."""
+"""A start of the oracle's search for a known system: the best path through the grid of its states over an episode."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def compile_beam_start(model: Model, degree: int = 0) -> Callable[..., None]:
     """``beam_start(record, first, cells, objective, information_rate, rng_state, u)``, compiled for a model.
 
     It fills in the inputs u (T,) from sample ``first`` on, for a system at the means of the belief, with a grid of
-    ``cells`` along each axis. ``information_rate`` (K, K) is the information per sample that is expected of the rest of
-    the episode. The record is overwritten.
+    ``cells`` along each axis. ``information_rate`` (K, K) is the expected information per sample in the rest of the
+    episode. The record is overwritten.
 
     Args:
         model: the equation.
-        degree: of the input's polynomial over a sample.
+        degree: degree of the input's polynomial over a sample.
     """
     size, k = compile_belief_rollout(model, degree).size, model.n_coefficients
     workspace, find_best_plan = compile_grid_beam_search(model, degree)

@@ -12,22 +12,22 @@ with equality for one V. Let v_t = Wᵀ f(x_t, x_{t-1}, x_{t-2}), with odd monom
     log det M ≤ tr(G M) - log det G - 4,
 
 so that the criterion of every input is at most ½ [tr(G Λ0) - log det G - 4 + the maximum of Σ |φ_t - (A V)_t|²_G / q +
-|v_t|²_G / r]. Each term depends on five displacements in a row, and so the most is found by a dynamic
-programme (`research.oracles.state_grid`). Under a limit of energy, the energy that is left is one more state: a price
-of energy instead would bound mixtures of inputs too, of which those of rest and much energy have much more information.
+|v_t|²_G / r]. Each term depends on five consecutive displacements, so a dynamic programme finds the maximum
+(`research.oracles.state_grid`). Under an energy limit, the energy that is left is one more state. A price of energy
+would bound mixtures of inputs too, and a mixture of rest and of a strong input has much more information.
 
-**G and W** are those of the best mixture of the paths that the programme has found so far; W is then a least squares
+**G and W** are optimal for the best mixture of the paths that the programme has found so far; W is then a least squares
 fit. Each programme adds a path to the mixture (Frank-Wolfe, fully corrective), until bound and mixture meet. The bound
-holds for any G and W. A path keeps the displacements that it was found with, since rounding may lead its inputs
-elsewhere; between nodes it may come to where one cannot stay within the limit, and is cut there.
+holds for any G and W. A path keeps the displacements that it was found with, because its rounded inputs may cause other
+ones. A path between nodes may enter a region from which no input stays within the limit, and is cut there.
 
-Where energy is limited, the best inputs lie between the levels of the grid, and the path that the programme finds is
-only near the best. So it climbs by gradient; and what it, or the mixture, then comes to is the bound where that of the
-grid is smaller.
+Where energy is limited, the best inputs lie between the levels of the grid, and the programme's path is only near the
+best one. Gradient steps therefore improve it. Where the grid's bound is smaller than the information of that path, or
+of the mixture, this information is the bound.
 
 **The grid.** The programme interpolates between nodes. Stored is the larger of the bounds on the grid and on a finer
 one (`StateGrid.refined`), plus their difference. This allowance is no proof, and it is weak where energy is limited:
-there the bound does not settle as intervals become more, and a finer grid can lie higher or lower.
+there the bound does not converge as the number of intervals grows, and a finer grid can give more or less.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from estimator.support.progress import iterate_with_progress
 from research.oracles.input_mixture import BoundMultipliers, InformationMoments, improve_mixture
 from research.oracles.state_grid import StateGrid
 
-#: Degrees of the monomials.
+#: Degrees of the monomials f.
 _MONOMIAL_DEGREES = (1, 3, 5)
 
 #: Nodes along an axis of the displacements.
@@ -64,28 +64,28 @@ _N_ENERGIES = 65
 #: Levels of an action, where energy is limited.
 _N_INPUTS = 17
 
-#: Ratio of the levels of an action in a path to those in the programme, where energy is limited.
+#: Ratio of the number of levels of an action in a path to their number in the programme, where energy is limited.
 _PATH_REFINEMENT = 8
 
-#: Gradient steps of a path, at most, where energy is limited.
+#: Largest number of gradient steps of a path, where energy is limited.
 _N_GRADIENT_STEPS = 30
 
-#: Length of the first of these steps, in parts of the root of the energy.
+#: Length of the first of these steps, relative to the root of the energy.
 _FIRST_STEP = 0.02
 
-#: Perturbation of an input for finite differences, in parts of the largest.
+#: Perturbation of an input for finite differences, relative to the largest input.
 _DIFFERENCE_FRACTION = 1e-4
 
 #: Programmes over which progress is measured, where energy is limited.
 _PATIENCE = 3
 
-#: Progress [nats] over these programmes below which they end.
+#: Progress [nats] over these programmes below which the iteration ends.
 _MIN_PROGRESS = 2e-3
 
-#: Programmes, at most.
+#: Largest number of programmes.
 _MAX_PROGRAMMES = 16
 
-#: Distance between bound and mixture [nats] at which programmes end.
+#: Distance between bound and mixture [nats] at which the iteration ends.
 _MAX_GAP = 0.01
 
 
@@ -93,8 +93,8 @@ class Certificate:
     """The bound of one system.
 
     Args:
-        systems: of a track with Eq. (2) as its plant.
-        row: the system.
+        systems: systems of a track whose plant is Eq. (2).
+        row: index of the system.
         n: nodes along an axis, an odd number.
 
     Raises:
@@ -119,7 +119,7 @@ class Certificate:
         return np.stack([np.prod([parts[i] for i in power], axis=0) for power in self.powers], axis=-1)
 
     def regressors(self, now: FloatArray, last: FloatArray, u: FloatArray) -> FloatArray:
-        """(..., 4) φ of the sample from (x_t, x_{t-1}) under u_t, in units in which Λ0 is the identity."""
+        """Regressors φ (..., 4) of the sample from (x_t, x_{t-1}) under u_t, in units in which Λ0 is the identity."""
         phi: FloatArray = np.stack(np.broadcast_arrays(now, now**3, last, u), axis=-1) @ self.units
         return phi
 
@@ -129,7 +129,7 @@ class Certificate:
         return slope
 
     def regressors_along(self, u: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Φ (..., T, 4), and the features (..., T, f) that V is made of and A V is made of.
+        """Φ (..., T, 4), and the features (..., T, f) of V and of A V.
 
         ``x`` (..., T) are the displacements that follow each of the inputs ``u`` (..., T).
         """
@@ -139,12 +139,12 @@ class Certificate:
         return self.regressors(back[1], back[2], u), f, f - self.slope(back[1])[..., None] * f1 - self.theta[2] * f2
 
     def moments(self, u: FloatArray, x: FloatArray | None = None) -> InformationMoments:
-        """Those of an input (T,); the displacements ``x`` (T,) are calculated where they are not given."""
+        """The moments of an input (T,); the displacements ``x`` (T,) are calculated where they are not given."""
         phi, f, moved = self.regressors_along(u, free_run(difference(), self.theta, u) if x is None else x)
         return phi.T @ phi / self.q, moved.T @ phi / self.q, moved.T @ moved / self.q + f.T @ f / self.r
 
     def attained_sum(self, multipliers: BoundMultipliers, u: FloatArray, x: FloatArray) -> FloatArray:
-        """(n,) the sum that the programme maximises, of inputs and displacements (n, T) from rest."""
+        """The sum (n,) that the programme maximises, for inputs and displacements (n, T) from rest."""
         root = np.linalg.cholesky(multipliers.G)
         phi, f, moved = self.regressors_along(u, x)
         residual, v = phi @ root - moved @ (multipliers.W @ root), f @ (multipliers.W @ root)
@@ -152,7 +152,7 @@ class Certificate:
         return total
 
     def ascend(self, multipliers: BoundMultipliers, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """An admissible input (T,) near ``u`` that tells more, by gradient; and the displacements (T,) that follow."""
+        """An admissible input (T,) near ``u`` with more information, by gradient steps, and its displacements (T,)."""
 
         def simulate(inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
             x = np.stack([free_run(difference(), self.theta, one) for one in inputs])
@@ -183,7 +183,7 @@ class Certificate:
         root = np.linalg.cholesky(multipliers.G)
         W = multipliers.W @ root
         u, after = (np.nan_to_num(found) for found in grid.actions(now[..., 0], last[..., 0]))
-        # v_{t+1} (n, n, inputs + 2, 4), and what the motion makes of v_t and v_{t-1} (n, n, levels, levels, 4)
+        # v_{t+1} (n, n, inputs + 2, 4), and the terms of A V in v_t and v_{t-1} (n, n, levels, levels, 4)
         next_v = self.features(after, now[..., 0], last[..., 0]) @ W
         wanted = self.regressors(now[..., 0], last[..., 0], u) @ root - next_v
         carried = self.slope(now)[..., None] * (self.features(now, last, second) @ W)
@@ -197,7 +197,7 @@ class Certificate:
         return self._at_most(multipliers, most), V
 
     def path(self, multipliers: BoundMultipliers, V: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The input (T,) that the programme holds for the best, from rest, and the displacements (T,) it leads to."""
+        """The programme's best input (T,) from rest, and its displacements (T,)."""
         grid, root = self.grid, np.linalg.cholesky(multipliers.G)
         if grid.energies > 1:
             grid = replace(grid, inputs=_PATH_REFINEMENT * (grid.inputs - 1) + 1)
@@ -223,11 +223,11 @@ class Certificate:
         return u, x
 
     def find_bound(self, inputs: FloatArray, rounds: int = _MAX_PROGRAMMES) -> float:
-        """The bound [nats] of the worth ½ log det(Λ0 + F) of every admissible input.
+        """The upper bound [nats] of ½ log det(Λ0 + F) over all admissible inputs.
 
         Args:
-            inputs: (k, T) to begin the mixture with, such as the oracle's.
-            rounds: programmes at most.
+            inputs: (k, T) inputs of the first mixture, such as the oracle's.
+            rounds: largest number of programmes.
         """
         moments = [self.moments(u) for u in inputs]
         weights = np.full(len(moments), 1.0 / len(moments))
@@ -257,14 +257,14 @@ class Certificate:
         return max(refined, least_bound) + abs(refined - least_bound)
 
     def _at_most(self, multipliers: BoundMultipliers, most: float) -> float:
-        """The bound [nats], with the most that the programme's sum comes to."""
+        """The bound [nats] from the maximum of the programme's sum."""
         more = np.trace(multipliers.G) + most - np.linalg.slogdet(multipliers.G)[1] - 4.0
         return self.base + 0.5 * float(more)
 
 
 @dataclass(frozen=True)
 class Config:
-    """Bound what inputs to the systems of a stored oracle can be worth, and store it beside the oracle."""
+    """Bound the information of any input to the systems of a stored oracle, and store the bounds beside the oracle."""
 
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
@@ -275,7 +275,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Bound, store, and say how much of what is possible the oracle certainly has."""
+    """Calculate and store the bounds, and print which share of the attainable information the oracle certainly has."""
     began = time.perf_counter()
     systems = TrackSystems.of(config.env, config.systems, config.options)
     oracle = Oracle.of(TrackSystems.of(config.env, max(config.systems, Oracle.count_stored(systems)), config.options))

@@ -9,7 +9,7 @@ from estimator.compilation.simd import jit, kernel
 
 @jit
 def cubic_weights(at):
-    """The weights of values at 0, 1, 2 and 3, of the cubic through them."""
+    """Lagrange weights of the cubic through values at 0, 1, 2 and 3."""
     return (
         -(at - 1.0) * (at - 2.0) * (at - 3.0) / 6.0,
         at * (at - 2.0) * (at - 3.0) / 2.0,
@@ -20,7 +20,7 @@ def cubic_weights(at):
 
 @jit
 def _add_weighted(line, weight, V, k, i, c, parts, a):
-    """Add values of displacement k, between three levels from c on, by a weight."""
+    """Add ``weight`` times the values at displacement k, interpolated between three levels from c on."""
     for d in range(3):
         part = weight * parts[d]
         if part != 0.0:
@@ -30,10 +30,10 @@ def _add_weighted(line, weight, V, k, i, c, parts, a):
 
 @jit
 def _interpolate_energies(V, alive, k, share, i, c, parts, a, line):
-    """Of all energies (K,): between displacements k and k + 1, and three levels from c on.
+    """Interpolate for all energies (K,) between displacements k and k + 1, and three levels from c on.
 
-    Through four displacements, or two where the others are none or are dead. Whether a node is dead does not depend on
-    the inputs that led there.
+    The interpolation uses four displacements, or two where the others do not exist or are dead. Whether a node is dead
+    does not depend on the inputs that led there.
     """
     n = V.shape[0]
     line[:] = 0.0
@@ -61,9 +61,9 @@ def _interpolate_energies(V, alive, k, share, i, c, parts, a, line):
 
 @jit
 def _locate_energies(spent, at, weights):
-    """Where an input leads from every energy: the first of four nodes (K,), -1 if it is not allowed.
+    """The energy that is left after an input, for every energy: the first of four nodes (K,), -1 if it is not allowed.
 
-    ``weights`` (K, 5) are those of the four, and in the last column the place among all nodes.
+    The columns of ``weights`` (K, 5) are the weights of the four nodes, and the position among all nodes.
     """
     last = len(at) - 1
     for k in range(last + 1):
@@ -79,7 +79,7 @@ def _locate_energies(spent, at, weights):
 
 @jit
 def _value_after_spending(line, at, weights, later):
-    """The value after an input from every energy, by those of all energies after it."""
+    """The value after an input from every energy, interpolated between the values of all energies after it."""
     last = len(line) - 1
     for k in range(last + 1):
         first = at[k]
@@ -100,7 +100,7 @@ def _value_after_spending(line, at, weights, later):
 
 @jit
 def _parabola_gain(low, middle, high, x, m):
-    """What a parabola through three values, of which the middle one is the largest, has more at its top."""
+    """The maximum of the parabola through three values above the middle value, which is the largest."""
     before, after = x[m] - x[m - 1], x[m + 1] - x[m]
     rise, fall = (middle - low) / before, (high - middle) / after
     curvature = (fall - rise) / (before + after)
@@ -122,7 +122,7 @@ def solve_backward(costs, low, share, level, parts, spent, held, samples, V):
     V[samples % len(V)] = 0.0
     for t in range(samples - 1, -1, -1):
         after, here = V[(t + 1) % len(V)], V[t % len(V)]
-        for i in range(n // 2 + 1):  # the other half is this one turned over
+        for i in range(n // 2 + 1):  # the other half is the mirror image
             for j in range(n):
                 if energies > 1:
                     for m in range(len(held), actions):

@@ -1,4 +1,4 @@
-"""The best mixture of inputs by their moments: what a bound is taken with (`research.oracles.certificate`)."""
+"""Best mixture of inputs by their moments; it gives the multipliers of a bound (`research.oracles.certificate`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator.support.array_types import FloatArray
 
-#: Of an input: C (4, 4), N (f, 4) and M (f, f), with which its information is at most C - WᵀN - NᵀW + WᵀMW.
+#: Moments C (4, 4), N (f, 4) and M (f, f) of an input. Its information is at most C - WᵀN - NᵀW + WᵀMW.
 InformationMoments = tuple[FloatArray, FloatArray, FloatArray]
 
 #: Steps that improve a mixture.
@@ -17,7 +17,7 @@ _N_STEPS = 200
 
 @dataclass(frozen=True)
 class BoundMultipliers:
-    """What a bound is taken with.
+    """The multipliers of a bound.
 
     Attributes:
         G: (4, 4), in units in which Λ0 is the identity.
@@ -34,11 +34,11 @@ def improve_mixture(
     """Improve a mixture of inputs by exponentiated gradient.
 
     Args:
-        moments: of every input, in units in which Λ0 is the identity.
-        weights: (inputs,) to begin with, which add up to 1.
+        moments: moments of every input, in units in which Λ0 is the identity.
+        weights: (inputs,) initial weights, which add up to 1.
 
     Returns:
-        Its weights, its gain of information [nats], and the multipliers of its bound.
+        The weights of the mixture, its gain of information [nats], and the multipliers of its bound.
     """
     C, N, M = (np.array(part) for part in zip(*moments, strict=True))
 
@@ -58,7 +58,7 @@ def improve_mixture(
     value, gains, found = information_and_gains(weights)
     rate = 1.0
     for _ in range(_N_STEPS):
-        # In parts of the step that changes weights by a factor e.
+        # Relative to the step that changes weights by a factor e.
         tried = weights * np.exp(rate * (gains - gains.max()) / (1e-12 + float(np.ptp(gains))))
         tried /= tried.sum()
         new = information_and_gains(tried)

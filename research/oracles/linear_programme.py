@@ -1,7 +1,7 @@
 """Linear programme of a step of `research.oracles.slp_refinement`: the best small change of an input within its limits.
 
-HiGHS solves it once for every step. From one step to the next its numbers change and its shape does not, so each
-solution starts from the basis of the last, and takes far fewer pivots than from nothing.
+HiGHS solves it once for every step. The numbers change from one step to the next and the shape does not, so each
+solution starts from the last basis, and takes far fewer pivots than a cold start.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def import_highspy() -> Any:
 
 
 class LinearProgramme:
-    """The programmes of one polishing.
+    """The linear programmes of one refinement.
 
     Args:
-        samples: T.
-        n: states.
-        output_state: the state that the first sensor shows, or n where it shows another output.
-        limits: to be kept; ``soft_limit`` is the limit of the signal.
+        samples: number of samples T.
+        n: number of states.
+        output_state: index of the state that the first sensor measures, or n where it measures another output.
+        limits: limits of the programmes; ``soft_limit`` is the limit of the signal.
 
     Raises:
         ModuleNotFoundError: as `import_highspy`.
@@ -51,7 +51,7 @@ class LinearProgramme:
             self._solver.setOptionValue(option, value)
         self._basis: Any = None
         self._n, self._output_state, self._limits = n, output_state, limits
-        self._n_quantities = max(n, output_state + 1)  # of what a sample leads to: states, and what is shown
+        self._n_quantities = max(n, output_state + 1)  # rows of a sample's result: the states and the output
         t, width = np.arange(samples), self._n_quantities
         rows, columns = [], []
         for i in range(width):
@@ -70,14 +70,14 @@ class LinearProgramme:
     def best_change(
         self, u: FloatArray, gradient: FloatArray, output_signal: FloatArray, jacobians: FloatArray, radius: float
     ) -> tuple[FloatArray, FloatArray] | None:
-        """The best change (T,) of the inputs to first order, and that of the states (T, n) before every sample.
+        """The best change (T,) of the inputs to first order, and the change of the states (T, n) before every sample.
 
         Args:
-            u: (T,) the inputs.
-            gradient: (T,) of the worth.
-            output_signal: (T,) what the first sensor shows.
+            u: (T,) inputs.
+            gradient: (T,) gradient of the criterion.
+            output_signal: (T,) output of the first sensor.
             jacobians: (T, n + 1, n + 3) as `research.oracles.slp_refinement.Linearisation`.
-            radius: of the change.
+            radius: largest change of an input.
 
         Returns:
             None where no change of at most ``radius`` keeps the limits.
@@ -109,7 +109,7 @@ class LinearProgramme:
         return found[:samples], states
 
     def _solve(self, matrix: Any, objective: FloatArray, bounds: FloatArray, energy_left: float) -> FloatArray | None:
-        """The solution that costs least, where the last row is at most ``energy_left`` and the others are 0."""
+        """The optimal solution with the last row at most ``energy_left`` and the other rows equal to 0."""
         highspy, solver = self._highspy, self._solver
         rows = np.zeros((matrix.shape[0], 2))
         rows[-1] = -np.inf, energy_left

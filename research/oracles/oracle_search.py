@@ -41,29 +41,28 @@ from research.oracles.beam_start import compile_beam_start
 from research.oracles.linear_programme import import_highspy
 from research.oracles.slp_refinement import refine_input
 
-#: Starts of a search, at least.
+#: Smallest number of starts of a search.
 _MIN_STARTS = 24
 
-#: Ratio of its starts, at most, to the starts at least.
+#: Ratio of the largest number of starts to the smallest.
 _MAX_START_FACTOR = 8
 
 #: Fresh starts that must agree for a search to end.
 _N_AGREEING = 3
 
-#: Difference [nats] within which they agree.
+#: Difference [nats] within which starts agree.
 _AGREEMENT = 0.002
 
-#: Cells of the grid along each axis, of which one is drawn for every start.
+#: Numbers of grid cells along each axis; every start draws one of them.
 _CELL_COUNTS = (24, 32, 48, 64, 96)
 
-#: Standard deviations of the logarithms of factors on the expected information rate, one of which is drawn for every
-#: start.
+#: Standard deviations of the logarithms of factors on the expected information rate; every start draws one of them.
 _RATE_SPREADS = (0.1, 0.3, 0.8)
 
-#: Systems and starts of a command at most.
+#: Largest numbers of systems and of starts of a command.
 _MAX_COUNT = 100_000
 
-#: Part of the limits of signal and energy that searches use, as stored inputs are rounded.
+#: Fraction of the limits of signal and energy that searches use, because stored inputs are rounded.
 _LIMIT_FRACTION = 1.0 - 1e-4
 
 
@@ -72,20 +71,20 @@ def search_best_input(
 ) -> tuple[FloatArray, float, float]:
     """Search the best input of one system.
 
-    A start is the best way through the map of the states, whose criterion expects of the rest of the way the rate of
-    information that the best input so far has brought, each coefficient's changed at random; every second one keeps the
-    start of the best input. Under a limit of energy a start is a burst that pushes as the system moves.
+    A start is the best path through the grid of the states. Its criterion assumes for the rest of the path the
+    information rate of the best input so far, with a random factor per coefficient. Every second start keeps the
+    beginning of the best input. Under an energy limit a start is a burst in the direction of the velocity.
 
     Args:
-        systems: of a track.
-        row: the system.
-        initial_inputs: (k, samples) inputs to start from besides [V].
-        rng: of the starts.
-        n_starts: starts besides those given, at least.
+        systems: systems of a track.
+        row: index of the system.
+        initial_inputs: (k, samples) further inputs to start from [V].
+        rng: random generator of the starts.
+        n_starts: smallest number of starts besides ``initial_inputs``.
 
     Returns:
-        The best input (samples,) [V] that keeps all limits also as it is stored; its worth [nats], -inf if none; and by
-        how much that is above the third best of the starts that began anew [nats], infinite if there are fewer.
+        The best input (samples,) [V] that keeps all limits after rounding for storage; its criterion [nats], -inf
+        without one; and the difference to the third best fresh start [nats], infinite with fewer than three.
     """
     one, model = systems.rows(row, row + 1), systems.plant.model
     exact = systems.limits
@@ -125,7 +124,7 @@ def _beam_search_start(
     one: TrackSystems, limits: DesignLimits, state_scales: FloatArray, best: FloatArray, keeps_beginning: bool,
     rng: np.random.Generator, rng_state: np.ndarray,
 ) -> FloatArray:  # fmt: skip
-    """The plan of a beam search; with ``keeps_beginning`` it begins as the best input so far."""
+    """The plan of a beam search; with ``keeps_beginning`` it begins like the best input so far."""
     model = one.plant.model
     n, size = model.n_states, len(model.names)
     mean, cov = np.zeros(size), np.zeros((size, size))
@@ -147,7 +146,7 @@ def _beam_search_start(
 
 
 def _burst_start(one: TrackSystems, limits: DesignLimits, rng_state: np.ndarray) -> FloatArray:
-    """A burst that pushes as the system moves, improved by its gradient."""
+    """A burst in the direction of the velocity, improved by its gradient."""
     u = np.empty((1, one.samples))
     compile_energy_limited_plan(one.plant.model, one.degree).resonant_bursts(
         one.nominal_system(0), limits.output, limits.energy, u, rng_state
@@ -159,7 +158,7 @@ def _burst_start(one: TrackSystems, limits: DesignLimits, rng_state: np.ndarray)
 
 
 def oracle_to_improve(systems: TrackSystems) -> Oracle:
-    """The stored oracle, with systems that it lacks at rest and worth -inf."""
+    """The stored oracle; systems without a stored input get zero input and criterion -inf."""
     n = len(systems.theta)
     inputs, values, bounds = np.zeros((n, systems.samples)), np.full(n, -np.inf), np.full(n, np.nan)
     count = Oracle.count_stored(systems)
@@ -170,7 +169,7 @@ def oracle_to_improve(systems: TrackSystems) -> Oracle:
 
 
 def compare_with_stored(oracle: Oracle, first: int, n_starts: int, seed: int) -> Iterator[str]:
-    """What searches from fresh starts, twice as long, gain over what is stored: a line for each system, and for all."""
+    """The gain of fresh searches, twice as long, over the stored inputs: a line for each system, and a line for all."""
     none, found = np.empty((0, oracle.systems.samples)), []
     for row in iterate_with_progress((f"system {row}", row) for row in range(first, len(oracle.values))):
         rng = np.random.default_rng([seed, row, 1])  # not [seed, row, 0], which is the same as [seed, row]
@@ -188,7 +187,7 @@ def compare_with_stored(oracle: Oracle, first: int, n_starts: int, seed: int) ->
 
 @dataclass(frozen=True)
 class Config:
-    """Search D-optimal inputs at the true parameters, and store what is better than what is stored."""
+    """Search D-optimal inputs at the true parameters, and store those that are better than the stored ones."""
 
     env: str = "duffing_env/Amplitude-v0"
     """Id of the track."""
@@ -213,14 +212,14 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Search, store, and say how far it is."""
+    """Search, store, and print progress."""
     import_highspy()
     systems = TrackSystems.of(config.env, config.systems, config.options)
     began = time.perf_counter()
     if config.check:
         for line in compare_with_stored(Oracle.of(systems), config.first, config.tries, config.seed):
             print_texts_and_tables(line)
-            sys.stdout.flush()  # at once: a check that is cut short leaves what it found
+            sys.stdout.flush()  # at once, so that an interrupted check leaves its results
         print_texts_and_tables(f"{time.perf_counter() - began:.0f} s")
         return
     count = max(config.systems, Oracle.count_stored(systems))
@@ -231,7 +230,7 @@ def main(config: Config) -> None:
         found, value, _ = search_best_input(oracle.systems, row, starts, rng, config.tries)
         if value > oracle.values[row]:
             oracle.inputs[row], oracle.values[row] = found, value
-        if row + 1 == config.systems or row % 8 == 7:  # a search that is cut short leaves what it found
+        if row + 1 == config.systems or row % 8 == 7:  # an interrupted search leaves its results
             path = oracle.head(int(np.isfinite(oracle.values).sum())).save()
     gained = oracle.values - 0.5 * np.linalg.slogdet(oracle.systems.precision)[1]
     seconds = time.perf_counter() - began

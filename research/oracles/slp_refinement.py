@@ -6,9 +6,9 @@ every sample, and HiGHS finds the best change of at most ``radius`` within the l
     max gᵀδ    with    ξ_{t+1} = A_t ξ_t + B_t δ_t,    |x_t + C_t ξ_t + D_t δ_t| ≤ limit,    |u_t + δ_t| ≤ amplitude,
                        |δ_t| ≤ radius,    2 uᵀδ ≤ energy - uᵀu.
 
-The curvature that is left out would add up over the samples, and keep the steps small. So the input follows the planned
+The neglected curvature would add up over the samples and keep the steps small. Therefore the input follows the planned
 states by feedback (the gains of a linear quadratic regulator), which stops the propagation of errors: tens of
-programmes of some milliseconds then reach a maximum, and hundreds do not without it.
+programmes of some milliseconds then reach a maximum, and hundreds do not without the feedback.
 """
 
 from __future__ import annotations
@@ -26,29 +26,31 @@ from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 from research.oracles.linear_programme import LinearProgramme
 
-#: The first radius in parts of the amplitude, and the one at which a search ends.
+#: First radius, and the radius at which a search ends, as fractions of the amplitude.
 _FIRST_RADIUS, _MIN_RADIUS = 0.1, 1e-5
 
-#: A search ends where a step gains less [nats].
+#: Gain of a step [nats] below which a search ends.
 _MIN_GAIN = 1e-5
 
-#: Linear programmes over which the pace of a search is measured. It becomes slower, so what is given up is far off.
+#: Linear programmes over which the pace of a search is measured. The pace only falls, so a search that is abandoned
+#: would not have reached its target.
 _N_PROGRAMMES_MEASURED = 8
 
-#: Worth [nats] of a signal beyond its limit, per part of it and sample, and of energy, where steps are compared.
+#: Penalty [nats] of a violated signal limit, per relative excess and sample, and of a violated energy limit, where
+#: steps are compared.
 _EXCESS_PENALTY, _ENERGY_PENALTY = 5.0, 20.0
 
-#: The price of the feedback's input, in parts of its amplitude, against states in parts of their sizes.
+#: Weight of the feedback's input, relative to its amplitude, against states relative to their scales.
 _FEEDBACK_INPUT_WEIGHT = 1e-2
 
 
 class Linearisation(NamedTuple):
-    """A path and its slopes.
+    """A trajectory and its derivatives.
 
     Attributes:
-        gradient: (T,) of the worth by the inputs.
-        output_signal: (T,) what the first sensor shows.
-        states: (T, n) before every sample.
+        gradient: (T,) derivatives of the criterion by the inputs.
+        output_signal: (T,) output of the first sensor.
+        states: (T, n) states before every sample.
         jacobians: (T, n + 1, n + 3) of the states after a sample, and of the output then, by the states before it, its
             input, the last one and the one before.
     """
@@ -60,7 +62,7 @@ class Linearisation(NamedTuple):
 
     @classmethod
     def empty(cls, samples: int, n: int) -> Linearisation:
-        """One to be filled in."""
+        """A linearisation with room for T samples, to be filled in."""
         return cls(np.empty(samples), np.empty(samples), np.empty((samples, n)), np.empty((samples, n + 1, n + 3)))
 
 
@@ -71,8 +73,8 @@ def _compile_linearisation(model: Model, degree: int) -> tuple[Any, Any]:
     - ``linearise(nominal, limit, u, found)`` fills in a `Linearisation` from rest, and returns the criterion [nats] and
       the peak of the signal.
     - ``track_states(nominal, amplitude, unit, nominal_inputs, states, jacobians, weights, u)`` fills in the inputs u
-      (T,), multiples of ``unit``, that track states (T, n) planned for ``nominal_inputs`` (T,), with weights (n,) of
-      the states' errors.
+      (T,), multiples of ``unit``, that track the states (T, n) planned for ``nominal_inputs`` (T,), with weights (n,)
+      of the state errors.
     """
     found = compile_d_optimality(model, degree)
     code, workspace_for, criterion_and_gradient, earlier = (
@@ -165,23 +167,24 @@ def refine_input(
     max_programmes: int = 80,
     target_value: float = -np.inf,
 ) -> tuple[FloatArray, float]:
-    """Improve an input from rest until no small change does.
+    """Improve an input from rest until no small change improves it further.
 
     Args:
         model: the equation.
-        degree: of the input's polynomial over a sample.
+        degree: degree of the input's polynomial over a sample.
         nominal: the system and its prior precision.
-        limits: of the input; ``soft_limit`` is the signal's in programmes. The energy may be exceeded a little.
-        state_scales: (n,) of the states (`agents.planning.time_scales.TimeScales`).
+        limits: limits of the input; ``soft_limit`` is the limit of the signal in programmes. The energy may be exceeded
+            a little.
+        state_scales: (n,) scales of the states (`agents.planning.time_scales.TimeScales`).
         u: (T,) inputs, which may be beyond the limits of signal and energy.
-        quantum: that inputs are multiples of, and the amplitude too. Rounding them afterwards would lead far away: of a
-            hard oscillator errors grow by several powers of ten over an episode.
-        max_programmes: linear programmes at most.
-        target_value: criterion [nats] to reach. An input is given up where this is out of reach at the pace of the last
-            programmes.
+        quantum: step of the inputs, which are multiples of it, as is the amplitude. Rounding them afterwards would
+            change the trajectory: in a chaotic motion errors grow by several powers of ten over an episode.
+        max_programmes: largest number of linear programmes.
+        target_value: criterion [nats] to reach. The search ends early where the pace of the last programmes would not
+            reach it.
 
     Returns:
-        The input and its criterion [nats]; -inf where it does not keep the limits.
+        The input and its criterion [nats], which is -inf where the input breaks a limit.
     """
     linearise, track_states = _compile_linearisation(model, degree)
     current, candidate = Linearisation.empty(len(u), model.n_states), Linearisation.empty(len(u), model.n_states)
@@ -191,7 +194,7 @@ def refine_input(
 
     def merit_of(inputs: FloatArray, found: Linearisation) -> tuple[float, float, float]:
         value, peak = linearise(nominal, limits.soft_limit, inputs, found)
-        if not np.isfinite(found.jacobians).all():  # so far beyond the limit that the equation has blown up
+        if not np.isfinite(found.jacobians).all():  # the equation has diverged, far beyond the limit
             return -np.inf, np.inf, -np.inf
         excess = float(np.maximum(0.0, np.abs(found.output_signal) / limits.soft_limit - 1.0).sum())
         overspent = max(0.0, float(inputs @ inputs) / limits.energy - 1.0)
@@ -206,7 +209,7 @@ def refine_input(
         change = programme.best_change(
             best, current.gradient, current.output_signal, current.jacobians, radius * limits.amplitude
         )
-        if change is None:  # no small change leads within the limits
+        if change is None:  # no small change satisfies the limits
             radius *= 2.0
             if radius > 2.0:
                 break
@@ -246,6 +249,6 @@ def refine_input(
 
 
 def _shrink_to_energy(u: FloatArray, limits: DesignLimits) -> FloatArray:
-    """Inputs shrunk to their energy."""
+    """Inputs scaled down to the energy limit."""
     energy = float(u @ u)
     return u if energy <= limits.energy else u * np.sqrt(limits.energy / energy) * (1.0 - 1e-12)

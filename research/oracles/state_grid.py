@@ -1,13 +1,14 @@
 """The dynamic programme over the states of Eq. (2) that bounds an information (`research.oracles.certificate`).
 
 A node is (x_t, x_{t-1}, u_{t-1}, u_{t-2}), from which the equation gives x_{t-2} and x_{t-3}: displacements on a grid
-of the box within the limit, inputs on levels. Where energy is limited, what is left of it is a part of the node, too.
-An action is an input at a level, or one that leads to the very limit. It leads to (x_{t+1}, x_t, u_t, u_{t-1}), where
-the value is interpolated; of two neighbours one of which cannot stay within the limit, the other counts.
+of the box within the limit, inputs on levels. Where energy is limited, the energy that is left belongs to the node,
+too. An action is an input at a level, or the input that moves the system exactly to the limit. It leads to (x_{t+1},
+x_t, u_t, u_{t-1}), where the value is interpolated. Where one of two neighbours cannot stay within the limit, only the
+other one counts.
 
-A limit of energy calls for inputs that are small most of the time, and that lie between levels. So levels, and nodes of
-the energy that is left, are closer to each other near none, as squares are; and the best of the levels gains what a
-parabola through it and its neighbours has at its top.
+Under an energy limit the best inputs are small most of the time, and lie between levels. Therefore the spacing of
+levels, and of nodes of the energy that is left, grows quadratically from 0. The value at the best level is replaced by
+the maximum of the parabola through it and its neighbours.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ class StateGrid:
 
     Attributes:
         theta: (4,) the coefficients of Eq. (2).
-        limit: of |x|.
-        amplitude: of |u|.
-        n: displacements along an axis, an odd number.
-        levels: of the inputs that a node is told by, an odd number.
-        inputs: levels of an action, an odd number.
-        energy: the limit of Σ u²; infinite where there is none.
-        energies: nodes of what is left of it, 1 where there is no limit and at least 4 where there is.
+        limit: limit of |x|.
+        amplitude: limit of |u|.
+        n: number of displacements along an axis, odd.
+        levels: number of levels of each input in a node, odd.
+        inputs: number of levels of an action, odd.
+        energy: limit of Σ u²; infinite without a limit.
+        energies: nodes of the energy that is left: 1 without a limit, at least 4 with one.
     """
 
     theta: FloatArray
@@ -51,9 +52,10 @@ class StateGrid:
 
     @property
     def refined(self) -> StateGrid:
-        """With twice as many intervals of displacements.
+        """The grid with twice as many intervals of displacements.
 
-        Where energy is limited, with 1.5 times as many of displacements and of energies, and twice as many of inputs.
+        Where energy is limited, it has 1.5 times as many intervals of displacements and of energies, and twice as many
+        of inputs.
         """
         if self.energies == 1:
             return replace(self, n=2 * self.n - 1)
@@ -64,7 +66,7 @@ class StateGrid:
     def nodes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """x_t (n, 1, 1, 1), x_{t-1} (1, n, 1, 1), x_{t-2} (n, n, levels, 1) and x_{t-3} (n, n, levels, levels).
 
-        Those that the equation gives are cut at the limit, beyond which no admissible path has been.
+        Displacements from the equation are cut at the limit, beyond which no admissible path has been.
         """
         t1, t2, t3, eta = self.theta
         x = np.linspace(-self.limit, self.limit, self.n)
@@ -75,7 +77,7 @@ class StateGrid:
         return now, last, second, third
 
     def actions(self, now: FloatArray, last: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inputs (..., inputs + 2) from states (..., 1), and where they lead; NaN for those that are not admissible."""
+        """Inputs (..., inputs + 2) from states (..., 1), and the displacements after them; NaN where inadmissible."""
         t1, t2, t3, eta = self.theta
         free = t1 * now + t2 * now**3 + t3 * last
         held = [np.broadcast_to(u, free.shape) for u in self._level_values(self.inputs)]
@@ -91,11 +93,11 @@ class StateGrid:
         return self.amplitude * (even if self.energies == 1 else even * np.abs(even))
 
     def displacement_cell(self, x: FloatArray) -> tuple[Indices, FloatArray]:
-        """The lower neighbours of displacements, and the shares of the upper ones."""
+        """The lower neighbours of displacements, and the weights of the upper ones."""
         return _interpolation_place((x / self.limit + 1.0) / 2.0, self.n)
 
     def level_weights(self, u: FloatArray) -> tuple[Indices, FloatArray]:
-        """The first of the three levels next to inputs, and their weights (..., 3), of the parabola through them."""
+        """The first of the three levels next to inputs, and the weights (..., 3) of the parabola through them."""
         nodes = self._level_values(self.levels)
         first = np.clip(np.abs(u[..., None] - nodes).argmin(axis=-1) - 1, 0, self.levels - 3)
         away = u[..., None] - nodes[first[..., None] + np.arange(3)]
@@ -108,7 +110,7 @@ class StateGrid:
         return first, np.stack(weights, axis=-1)
 
     def energy_cell(self, energy: FloatArray) -> tuple[Indices, FloatArray]:
-        """The lower neighbours of energies that are left, and the shares of the upper ones."""
+        """The lower neighbours of energies that are left, and the weights of the upper ones."""
         if self.energies == 1:
             return np.zeros(energy.shape, dtype=np.int64), np.zeros(energy.shape)
         return _interpolation_place(np.sqrt(np.maximum(energy, 0.0) / self.energy), self.energies)
@@ -116,10 +118,10 @@ class StateGrid:
     def interpolate(
         self, V: FloatArray, after: FloatArray, now: FloatArray, u: FloatArray, older: FloatArray, left: FloatArray
     ) -> FloatArray:
-        """The values (points,) at points between nodes, x_{t+1}, x_t, u_t, u_{t-1} and the energy left; -1e12 for dead.
+        """Values (points,) at points between nodes, x_{t+1}, x_t, u_t, u_{t-1} and energy left; -1e12 for dead points.
 
-        Through four nodes of displacements and energies, as in the programme; through two where one of them is dead. A
-        dead one of two does not count.
+        The interpolation uses four nodes of displacements and energies, as in the programme, and two where one of the
+        four is dead. A dead node of two does not count.
         """
         inputs = [
             (first[:, None] + np.arange(3), weights)
@@ -139,17 +141,17 @@ class StateGrid:
         return np.where(whole, smooth, np.where(weight > 1e-9, rough / np.maximum(weight, 1e-9), -1e12))
 
     def solve(self, costs: FloatArray, samples: int, layers: int) -> FloatArray:
-        """The most that costs add up to from every node on.
+        """The largest sum of costs from every node on.
 
         Args:
-            costs: (n, n, levels, levels, inputs + 2); whatever at actions that are not admissible. They must be the
-                same where x and u are turned over.
-            samples: of the path.
-            layers: that are kept, 2 or samples + 1.
+            costs: (n, n, levels, levels, inputs + 2); any value at inadmissible actions. They must be the same after a
+                change of sign of x and u.
+            samples: length of the path.
+            layers: number of layers that are kept, 2 or samples + 1.
 
         Returns:
-            (layers, n, n, levels, levels, energies), that of sample t in layer t modulo layers; -inf where no path
-            stays within.
+            The values (layers, n, n, levels, levels, energies), with sample t in layer t modulo layers; -inf where no
+            path stays within the limits.
         """
         now, last, _, _ = self.nodes
         u, after = self.actions(now[..., 0], last[..., 0])
@@ -165,14 +167,14 @@ class StateGrid:
 
 
 def _interpolation_place(where: FloatArray, count: int) -> tuple[Indices, FloatArray]:
-    """The lower neighbour, of ``count`` nodes between 0 and 1, and the share of the upper one."""
+    """The lower neighbour among ``count`` nodes between 0 and 1, and the weight of the upper one."""
     scaled = where * (count - 1)
     low = np.clip(np.floor(scaled + 1e-9), 0, count - 2).astype(np.int64)
     return low, np.clip(scaled - low, 0.0, 1.0)
 
 
 def _neighbouring_nodes(low: Indices, share: FloatArray, count: int, k: int) -> tuple[Indices, FloatArray]:
-    """The k nodes next to points, 4 or 2, and their weights, (points, k) each; one where there is but one."""
+    """The k nodes next to points, 4 or 2 (1 on an axis with one node), and their weights, (points, k) each."""
     if count == 1:
         return low[:, None], np.ones((len(low), 1))
     if k == 2:
@@ -184,7 +186,7 @@ def _neighbouring_nodes(low: Indices, share: FloatArray, count: int, k: int) -> 
 def _weighted_sum(
     V: FloatArray, nodes: list[tuple[Indices, FloatArray]]
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-    """Per point, the weighed sum over the nodes that are alive, the sum of their weights, and whether all are alive."""
+    """Per point, the weighted sum over the live nodes, the sum of their weights, and whether all are alive."""
 
     def along(axis: int, part: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return part.reshape(len(part), *(-1 if axis == other else 1 for other in range(V.ndim)))

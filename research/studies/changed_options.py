@@ -1,11 +1,11 @@
-"""What policies are worth where options differ from those that they were trained with, beside the planner there.
+"""Compares policies with the planner under options that differ from their training options.
 
     python -m research.studies.changed_options
 
 plays `efe`, the track's own policy and `ppo/universal` with other noises, a weaker input, more energy and a longer
 episode, on the tracks of both equations. D-efficiency is exp(2 (F - F_efe) / K), with F the Fisher information [nats]
-at the truth that each episode brought about the K coefficients (`fisher_gain` of `evaluate.py`), and F_efe that of the
-planner on the same system with the same noise.
+about the K coefficients at the truth that an episode gave (`fisher_gain` of `evaluate.py`), and F_efe the planner's on
+the same system with the same noise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from agents.result_files import write_json
 from duffing_env.experiment_config import SimulatedExperiment
 from estimator.support.progress import iterate_with_progress
 
-#: What is compared: a title, the track without its version, the options.
+#: Comparisons: a title, the track without its version, the options.
 CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("σ_w ÷ 5, σ_v × 5", "Amplitude", {"process_noise": 1e-4, "measurement_noise": 2.5e-3}),
     ("max_input 0.05", "Amplitude", {"max_input": 0.05}),
@@ -65,7 +65,7 @@ def shipped_policy_name(track: str, version: int) -> str:
 def compare_with_planner(
     track: str, options: dict[str, Any], policies: tuple[str, ...], systems: int
 ) -> Iterator[dict[str, Any]]:
-    """What every policy is worth beside the planner, which comes first.
+    """Evaluate every policy relative to the planner, which comes first.
 
     Yields:
         ``policy``, and arrays (systems,): ``efficiency``, ``fisher_gain`` [nats], and 1 in ``ended_early`` where a

@@ -4,15 +4,15 @@
 
 plays `duffing_env/Pendulum-v1`, which is the published experiment: Euler's rule with 0.05 s, diffusion 0.1 of the
 velocity, p1, p2, p3 Gaussian with means 14.7, 0, 3 and variances 0.1, 0.01, 0.1, from rest at the bottom, |u| ≤ 1, 50
-samples, and 1,024 systems. Angle and velocity are seen, and so the posterior of p1, p2 and p3 is exact, but for the
-first velocity, which the belief takes to be uncertain by 0.02 rad/s. Gains are prior entropy less posterior entropy.
-Left out of the publication is only a noise of 0.1 mrad of the angle, there to make a matrix regular; and where the
-angle goes beyond 4 rad the episode ends, which the table counts.
+samples, and 1,024 systems. Angle and velocity are measured, so the posterior of p1, p2 and p3 is exact, except that the
+belief takes the first velocity to be uncertain by 0.02 rad/s. Gains are prior entropy minus posterior entropy. Two
+things differ from the publication: its noise of 0.1 mrad of the angle, which makes a matrix regular, is absent; and an
+episode ends where the angle exceeds 4 rad, which the table counts.
 
 The published figures are from the repository Sahel13/InsideOutSMC.jl, experiments/pendulum/linear: the set-up
 stands in environment.jl, the evaluation in online_inference/make_plot.jl, the gains in the data's files
-linear_pendulum_info_gain_*.csv. Their last row says 50, but of 50 samples every fifth from the first on is taken, so
-that it is sample 46. The learned policies there were trained with a price of 0.1 on changes of the input.
+linear_pendulum_info_gain_*.csv. Their last row is labelled 50, but the rows are every fifth sample from the first on,
+so it is sample 46. The published policies were trained with a weight of 0.1 on changes of the input.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from estimator.support.array_types import FloatArray
 
 TRACK = "duffing_env/Pendulum-v1"
 
-#: The sample that published gains are of.
+#: The sample after which gains are published.
 PUBLISHED_SAMPLE = 46
 
 #: Published mean and standard deviation over systems, after `PUBLISHED_SAMPLE` samples [nats].

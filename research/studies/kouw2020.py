@@ -148,7 +148,7 @@ def run_all(record: SilverboxRecord, data: Path | None) -> dict[str, dict[str, V
 
 
 def compile_kernels(record: SilverboxRecord, data: Path | None) -> None:
-    """Compiles what `train_and_validate` trains with, so that its seconds do not count that.
+    """Compiles the kernels of `train_and_validate`, so that its seconds do not include compilation.
 
     Numba compiles anew for the record's arrays, which are read-only, and for the delayed copies of them.
     """
@@ -198,7 +198,7 @@ def train_online(setting: ExperimentSetting, nonlinear: bool, training: Regime) 
 
 
 def estimator_at(coefficients: FloatArray, input_delay: int) -> OnlineEstimator:
-    """An estimator that believes the coefficients (4,): for predictions and free runs with them."""
+    """An estimator whose belief is the coefficients (4,), for predictions and free runs."""
     prior = published_run_prior()
     record = prior.record.copy()
     record[2:6] = coefficients
@@ -222,7 +222,7 @@ def train_through_environment(setting: ExperimentSetting, nonlinear: bool, data:
     if terminated:
         raise RuntimeError(f"the episode must reach the end of the record, but was terminated before: {info}")
     means: FloatArray = env.unwrapped.belief.coefficients_mean  # type: ignore[attr-defined]
-    return means if nonlinear else np.insert(means, 1, 0.0)  # without the cubic term θ2 is no coefficient: it is 0
+    return means if nonlinear else np.insert(means, 1, 0.0)  # a model without the cubic term has θ2 = 0
 
 
 def make_environment(setting: ExperimentSetting, nonlinear: bool, data: Path | None) -> gym.Env:
@@ -246,7 +246,7 @@ def prediction_mse(predicted: FloatArray, y: FloatArray) -> float:
     0 in place of a prediction of y_3.
 
     Args:
-        predicted: (T,) predictions [V], of which the first three do not count.
+        predicted: (T,) predictions [V]; the first three are not used.
         y: (T,) measured outputs [V], T >= 3.
     """
     errors = predicted[2:] - y[2:]
@@ -255,7 +255,7 @@ def prediction_mse(predicted: FloatArray, y: FloatArray) -> float:
 
 
 def simulation_mse(simulated: FloatArray, y: FloatArray) -> float:
-    """Mean squared simulation error [V²] over y_3, ..., y_T: all but the two outputs that were given.
+    """Mean squared simulation error [V²] over y_3, ..., y_T: all but the two initial outputs.
 
     Args:
         simulated: (T,) free run [V].
@@ -319,7 +319,7 @@ def draw_errors(runs: Mapping[str, Any], validation: Regime, measure: str) -> Fi
 
     Args:
         runs: The models by name.
-        validation: What they were validated on.
+        validation: The validation part of the record.
         measure: ``prediction`` or ``simulation``.
     """
     figure = new_figure(11, 5.2)

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's algorithms as they come: their own hyperparameters, one environment, only the track is ours.
+"""Trains Stable-Baselines3's algorithms with their default hyperparameters on one environment of a track.
 
 $ python -m research.studies.sb3_baselines --algo ppo --seed 0
 $ duffing-env evaluate --protocol Short-v0 --policies "mine=runs/sb3-ppo-short-v0-*" --submit mine
@@ -20,7 +20,7 @@ from estimator.support.optional_dependencies import require_packages
 
 @dataclass(frozen=True)
 class Config:
-    """Train one of Stable-Baselines3's algorithms as it comes."""
+    """Train one of Stable-Baselines3's algorithms with its defaults."""
 
     algo: Literal["ppo", "sac", "tqc"] = "ppo"
     """Algorithm."""
@@ -37,7 +37,7 @@ class Config:
 
     @property
     def folder(self) -> Path:
-        """Where the policy goes."""
+        """The folder of the policy."""
         return Path("runs") / f"sb3-{self.algo}-{self.env.split('/')[-1].lower()}-{self.seed}"
 
 

@@ -1,4 +1,4 @@
-"""Ship a trained policy: the median of its training seeds, with a card that says what all of them are worth.
+"""Ship a trained policy: the median of its training seeds, with a card of the scores of all seeds.
 
     python -m research.studies.ship_policy --name ppo/amplitude --runs runs/ppo-amplitude-v0-[0-4]
 
@@ -69,7 +69,7 @@ def ship_median(config: Config) -> Path:
         scores = summarise_metrics(together)
         by = "efficiency" if "efficiency" in scores else "information_gain"
         print_comparison_table([together], f"{env}, {config.systems} systems")
-    chosen = median_index(scores[by].get("seeds", [0.0]))  # of one seed there are no seeds' own
+    chosen = median_index(scores[by].get("seeds", [0.0]))  # a single seed has no list of scores
     card = cards[chosen] | {
         "track": env,
         "version": version("duffing-env"),
@@ -78,7 +78,7 @@ def ship_median(config: Config) -> Path:
         "shipped": {"seed": seeds[chosen], "median_by": by},
         "scores": {
             "settings": {"env": env, "systems": config.systems, "seed": 0, "options": options},
-            # How long a decision took is of the machine, not of the policy.
+            # The time of a decision is a property of the machine, not of the policy.
             **{name: entry for name, entry in scores.items() if name != "decision_time"},
         },
     }
@@ -96,7 +96,7 @@ def _on_the_family(config: Config) -> dict[str, Any]:
 
 
 def _check_name(name: str, algorithm: str | None, env: str, card: Path) -> None:
-    """Refuse a name that is of other runs."""
+    """Refuse a name that belongs to other runs."""
     if name.partition("/")[0] != algorithm:
         raise ValueError(f"name must begin with the runs' algorithm, {algorithm}, but is {name!r}")
     if card.is_file() and (of := json.loads(card.read_text(encoding="utf-8"))["track"]) != env:
@@ -104,12 +104,12 @@ def _check_name(name: str, algorithm: str | None, env: str, card: Path) -> None:
 
 
 def median_index(values: list[float]) -> int:
-    """Which value is the median; of an even number the lower one of the two."""
+    """The index of the median value; of an even number of values, the lower one of the middle two."""
     return int(np.argsort(values, kind="stable")[(len(values) - 1) // 2])
 
 
 def card_of(run: Path) -> dict[str, Any]:
-    """The card of a finished run; of paths that begin at the root, which are of a machine, it keeps the names alone.
+    """The card of a finished run; of absolute paths, which depend on the machine, it keeps only the file names.
 
     Raises:
         ValueError: for a folder that holds no policy.
@@ -131,13 +131,13 @@ def _path_name(word: str) -> str:
 
 def write_shipped_policy(folder: Path, run: Path, card: dict[str, Any]) -> None:
     """Write a run's weights and a card into a folder of the package."""
-    # The weights first: a card without them counts for nothing, and a second try mends a card that is older.
+    # The weights come first: a second attempt repairs an older card, and a card without weights is not a policy.
     write_atomically(folder / WEIGHTS_FILE, (run / WEIGHTS_FILE).read_bytes())
     write_json(folder / CARD_FILE, card)
 
 
 def _shared_recipe(runs: tuple[Path, ...], cards: list[dict[str, Any]]) -> tuple[str, dict[str, Any], list[int]]:
-    """Track, options and seeds of runs that differ by nothing else than their seeds and folders."""
+    """Track, options and seeds of runs that differ only by their seeds and folders."""
     recipes = [
         {"algorithm": card.get("algorithm"), **card["config"]} | {"seed": None, "output": None, "systems": None}
         for card in cards

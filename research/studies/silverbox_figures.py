@@ -35,7 +35,7 @@ _SHOWN_FROM = 200
 
 
 def protocol_figures(outcomes: Mapping[str, ProtocolOutcome]) -> dict[str, Figure]:
-    """The three figures, ``arrow``, ``learning`` and ``parameters``, of outcomes by the names of their settings."""
+    """The three figures ``arrow``, ``learning`` and ``parameters`` of outcomes by setting name."""
     shown = {name: outcomes[name] for name in _COLOURS if name in outcomes}
     return {"arrow": _arrow(shown), "learning": _learning(shown), "parameters": _parameters(shown)}
 
@@ -62,7 +62,7 @@ def _arrow(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
 
 
 def _learning(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
-    """Simulation error on the arrow over the number of training samples."""
+    """Simulation error on the arrow against the number of training samples."""
     figure = new_figure(7, 4.5)
     axes = figure.add_subplot()
     for name, outcome in outcomes.items():
@@ -76,7 +76,7 @@ def _learning(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
 
 
 def _parameters(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
-    """Posterior means and 90 % intervals of the physical parameters over the number of training samples."""
+    """Posterior means and 90 % intervals of the physical parameters against the number of training samples."""
     figure = new_figure(11, 5.5)
     dimensions = duffing(offsets=True, cubic_damping=True, feedthrough=True).dimensions
     units = {name: Scales().unit(dimension) for name, dimension in dimensions.items()}
@@ -86,7 +86,7 @@ def _parameters(outcomes: Mapping[str, ProtocolOutcome]) -> Figure:
         posteriors = {n: belief.parameters() for n, belief in outcome.beliefs.items() if name.startswith("ODE")}
         for parameter in panels:
             if not all(parameter in parameters for parameters in posteriors.values()) or not posteriors:
-                continue  # it is known
+                continue  # the parameter is known
             mean, std = np.array([parameters[parameter][:2] for parameters in posteriors.values()]).T
             low, high, samples = (
                 mean - STDS_PER_90_PERCENT * std,

@@ -46,16 +46,16 @@ N_TIMINGS = 3
 
 @dataclass(frozen=True)
 class IdentificationSetting:
-    """A way to identify.
+    """The settings of one identification.
 
     Attributes:
-        model: what is identified.
-        rig: what the inputs do.
-        prior: None is the model's default.
+        model: equation to identify.
+        rig: description of how the inputs act.
+        prior: prior; None is the model's default.
         factorisation: ``structured`` or ``mean_field``.
-        as_published: with the published run's two departures from the derived messages.
-        passes: how often the training section is gone through; more than once is no longer online.
-        noise_hypotheses: ratios of the noises that are weighed by their evidence.
+        as_published: whether the published run's two departures from the derived messages apply.
+        passes: passes through the training section; an identification with more than one is not online.
+        noise_hypotheses: number of noise ratios that are weighted by their evidence.
     """
 
     model: Model
@@ -67,7 +67,7 @@ class IdentificationSetting:
     noise_hypotheses: int = 1
 
     def estimator(self) -> OnlineEstimator:
-        """An estimator that has seen nothing yet."""
+        """An estimator before its first sample."""
         return OnlineEstimator(
             self.model, self.prior, self.rig, factorisation=self.factorisation, as_published=self.as_published,
             noise_hypotheses=self.noise_hypotheses,
@@ -82,7 +82,7 @@ def _duffing_setting(
     return IdentificationSetting(model, Rig.silverbox(interpolation), passes=passes)
 
 
-#: A difference equation with one tap, on which the input acts a sample later; and with taps of its own.
+#: A difference equation with one tap, whose input acts a sample later; and one with several taps.
 _ONE_TAP, _MODEL_TAPS = Rig.silverbox("zero_order", 1), Rig.silverbox("zero_order", 0)
 
 _PUBLISHED = published_run_prior()
@@ -92,7 +92,7 @@ SETTINGS = {
     "paper, delay 1": IdentificationSetting(difference(), _ONE_TAP, _PUBLISHED, "mean_field"),
     "paper structured": IdentificationSetting(
         difference(), _ONE_TAP, silverbox_prior(state_std=0.1)
-    ),  # it begins in motion
+    ),  # the record begins in motion
     "NLARX offset": IdentificationSetting(difference("offset"), _ONE_TAP),
     "NLARX three-tap": IdentificationSetting(difference("three-tap"), _MODEL_TAPS),
     "NLARX three-tap, 9 ratios": IdentificationSetting(difference("three-tap"), _MODEL_TAPS, noise_hypotheses=9),
@@ -122,15 +122,15 @@ class Sections:
 
 @dataclass(frozen=True, eq=False)
 class ProtocolOutcome:
-    """What one setting came to.
+    """The results of one setting.
 
     Attributes:
         rmse: root mean square simulation error by test [V].
-        prediction_rmse: that of one-step predictions of the multisine test, at the posterior means [V].
-        coverage: fraction of the multisine test within the 90 % intervals of their forecasts, while the estimator goes
-            on learning; NaN in mean field, which makes none.
-        seconds: of training for each sample and pass, compiled.
-        free_energy: accumulated over the first pass [nats].
+        prediction_rmse: root mean square one-step prediction error of the multisine test, at the posterior means [V].
+        coverage: fraction of the multisine test within the 90 % intervals of its forecasts, while the estimator
+            continues to learn; NaN in mean field, which makes no forecasts.
+        seconds: training time for each sample and pass [s], without compilation.
+        free_energy: free energy accumulated over the first pass [nats].
         learning: simulation error on the arrow [V] after each number of training samples.
         beliefs: posterior after each number of training samples.
         arrow_error: (T,) simulated minus measured arrow [V].
@@ -162,7 +162,7 @@ def split_record(record: SilverboxRecord) -> Sections:
 
 
 def evaluate(setting: IdentificationSetting, sections: Sections) -> ProtocolOutcome:
-    """Identifies on the training section and on its beginnings, and tests what came out."""
+    """Identifies on the training section and on its beginnings, and evaluates the results on the tests."""
     training = sections.training
     learning, beliefs = {}, {}
     for samples in TRAINING_LENGTHS:
@@ -185,7 +185,7 @@ def evaluate(setting: IdentificationSetting, sections: Sections) -> ProtocolOutc
 
 
 def identify(setting: IdentificationSetting, training: Regime, samples: int) -> tuple[OnlineEstimator, float, float]:
-    """An estimator after the first samples of the training, its free energy [nats], and seconds for each of them."""
+    """An estimator after the first training samples, its free energy [nats], and the time per sample [s]."""
     u, y = training.u[:samples], training.y[:samples]
     estimator = setting.estimator()
     start = perf_counter()
@@ -202,7 +202,7 @@ def simulation_error(estimator: OnlineEstimator, test: Regime) -> FloatArray:
 
 
 def rmse(error: FloatArray) -> float:
-    """Root mean square [V] of an error (T,), but for the first `N_GIVEN_OUTPUTS`."""
+    """Root mean square [V] of an error (T,) without its first `N_GIVEN_OUTPUTS` values."""
     return float(np.sqrt(np.mean(error[N_GIVEN_OUTPUTS:] ** 2)))
 
 
@@ -216,7 +216,8 @@ def samples_until_close(learning: Mapping[int, float]) -> int | None:
 def coverage(estimator: OnlineEstimator, training: Regime, test: Regime) -> float:
     """Fraction of the outputs within their 90 % intervals, while a copy of the estimator goes on from the training.
 
-    A model that looks ahead has not used the last training sample yet, and does not come to use the last test sample.
+    An estimator with a lookahead processes an output once the next input is known: the last training output during the
+    test, and the last test output never.
     """
     copy = deepcopy(estimator)
     copy.run(test.u, test.y)

@@ -1,4 +1,4 @@
-"""Runs the official protocol (`research.studies.silverbox_protocol`), and says what came out.
+"""Runs the official protocol (`research.studies.silverbox_protocol`), and reports the results.
 
 `compare_on_validation` compares settings of the estimators without test data.
 """
@@ -63,7 +63,7 @@ def run_protocol(
         data: File or folder of the record; searched for where it is None (`load_record`).
         json: File for the results; None writes none.
         figures: Folder for ``silverbox_arrow.png``, ``silverbox_learning.png`` and ``silverbox_parameters.png``.
-        compare: What follows the table; None is nothing.
+        compare: Called after the table; None for nothing.
 
     Returns:
         What the JSON file holds: under ``rows`` the measures of each setting in volts, seconds and nats, under
@@ -159,7 +159,7 @@ def as_table(outcomes: Mapping[str, ProtocolOutcome]) -> Any:
 
 
 def compare_on_validation(data: Path | None = None) -> dict[str, dict[str, tuple[float, float]]]:
-    """Prints what other settings than the defaults give on the last quarter of the training section.
+    """Prints the results of settings other than the defaults on the last quarter of the training section.
 
     Args:
         data: File or folder of the record; searched for where it is None (`load_record`).

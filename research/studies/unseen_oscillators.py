@@ -1,4 +1,4 @@
-"""Comparison of policies with the planner on unseen oscillators of the family.
+"""Compares policies with the planner on unseen oscillators of the family.
 
     python -m research.studies.unseen_oscillators --policies ppo/universal shield prbs uniform silverbox-multisine
 
@@ -30,13 +30,13 @@ from estimator.support.progress import iterate_with_progress
 
 PLANNER = "efe"
 
-#: Of the family's draws: another word than that of any training.
+#: Seed word of the family's draws, which no training uses.
 _SEED_BRANCH = 2
 
 
 @dataclass(frozen=True)
 class Config:
-    """Judge policies on the family of oscillators."""
+    """Evaluate policies on the family of oscillators."""
 
     policies: tuple[str, ...] = ("ppo/universal", "shield", "prbs", "prbs-4", "uniform", "silverbox-multisine")
     """Names or run folders, beside the planner."""
@@ -58,7 +58,7 @@ def draw_unseen_rigs(n_rigs: int, seed: int = 0) -> list[FamilyMember]:
 
 
 def play_episode(rig: FamilyMember, policy: str, seed: int) -> tuple[float, float, float]:
-    """An episode: the information gained, 1 where a limit ended it, and the share of 90 % intervals with the truth."""
+    """Play an episode: information gained [nats], 1 where a limit ended it, share of 90 % intervals with the truth."""
     envs = make_track_batch(RIG_TRACK, 1, rig.options | TEST_OPTIONS)
     chosen = make_policy(policy, envs, seed=seed)
     observations, _ = envs.reset(seed=seed)
@@ -80,7 +80,7 @@ def play_episode(rig: FamilyMember, policy: str, seed: int) -> tuple[float, floa
 
 
 def oscillator_classes(rigs: Sequence[FamilyMember]) -> Iterator[tuple[str, npt.NDArray[np.bool_]]]:
-    """Name of a class of oscillators, and which of them are in it."""
+    """Name of a class of oscillators to a mask of its members."""
     stiffness_kinds = np.array([member.stiffness for member in rigs])
     yield "all", np.ones(len(rigs), dtype=np.bool_)
     for kind in dict.fromkeys(stiffness_kinds):

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from agents.planning.model_probe import observation_layout
 from agents.policies import make_policy
 
-#: Samples of an episode that are waited for.
+#: Samples of an episode before the planner starts.
 WAIT_SAMPLES = 390
 
 
