@@ -93,8 +93,8 @@ def main(versions: list[str]) -> int:
         except RuntimeError as error:
             faults = [str(error)]
         failed |= bool(faults)
-        told = "; ".join(faults) or f"{len(packages)} binary files, all that is needed"
-        print(f"Python {version}: {told}", flush=True)
+        verdict = "; ".join(faults) or f"{len(packages)} binary files, all that is needed"
+        print(f"Python {version}: {verdict}", flush=True)
     return failed
 
 

@@ -1,14 +1,14 @@
-"""Print name, version and licence of every package that is installed here, as its own metadata tells it."""
+"""Print name, version and licence of every package that is installed here, from its metadata."""
 
 from importlib.metadata import Distribution, distributions
 
 
 def licence(package: Distribution) -> str:
     """The licence expression; or the classifiers'; or the first line of the text."""
-    told = package.metadata
-    classes = [c.split(" :: ")[-1] for c in told.get_all("Classifier") or () if c.startswith("License :: ")]
-    lines = (told.get("License-Expression") or "; ".join(classes) or told.get("License") or "").splitlines()
-    return lines[0] if lines else "not told"
+    metadata = package.metadata
+    classes = [c.split(" :: ")[-1] for c in metadata.get_all("Classifier") or () if c.startswith("License :: ")]
+    lines = (metadata.get("License-Expression") or "; ".join(classes) or metadata.get("License") or "").splitlines()
+    return lines[0] if lines else "not stated"
 
 
 if __name__ == "__main__":

@@ -75,16 +75,16 @@ def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callabl
     module = importlib.import_module(f"benchmarks.{name}")
     if name == "estimators":
         module.write_samples(samples)
-    told: dict[str, Any] = {**vars(config), "peers": peers, "on_row": on_row}
-    section: Section = module.run(**{each: told[each] for each in inspect.signature(module.run).parameters})
+    arguments: dict[str, Any] = {**vars(config), "peers": peers, "on_row": on_row}
+    section: Section = module.run(**{each: arguments[each] for each in inspect.signature(module.run).parameters})
     return section
 
 
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, and the settings that a reader needs to repeat a run."""
-    told = cpuinfo()
+    processor = cpuinfo()
     return {
-        "processor": f"{told.get('model name', 'unknown processor')} (family {told.get('cpu family', '?')})",
+        "processor": f"{processor.get('model name', 'unknown processor')} (family {processor.get('cpu family', '?')})",
         "cores": CORES,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),

@@ -39,8 +39,8 @@ LONGEST = 3600.0
 def begin(output: Path, *words: str, **environment: str) -> subprocess.Popen:
     """Train all seeds into a folder, in a process of its own."""
     command = [sys.executable, str(ROOT / "train.py"), *WORDS, "--output", str(output), *words]
-    told = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
-    return subprocess.Popen(command, cwd=ROOT, env=told, stdout=subprocess.DEVNULL)
+    variables = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    return subprocess.Popen(command, cwd=ROOT, env=variables, stdout=subprocess.DEVNULL)
 
 
 def children(pid: int) -> list[int]:
@@ -127,8 +127,8 @@ def main() -> int:
             lost = killed[seed] - again[0] if seed in killed and again else 0
             is_right = one == other and first == 0 and len(again) == (seed in killed) and 0 <= lost <= INTERVAL
             wrong += not is_right
-            told = (f"{killed[seed]:,}", f"{again[0]:,}", f"{lost:,}") if seed in killed and again else ("-",) * 3
-            lines.append((str(seed), *told, "the same" if one == other else "others"))
+            counts = (f"{killed[seed]:,}", f"{again[0]:,}", f"{lost:,}") if seed in killed and again else ("-",) * 3
+            lines.append((str(seed), *counts, "the same" if one == other else "others"))
     titles = (
         "seed",
         "samples when its node was killed",

@@ -56,8 +56,8 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
     def cold(_: int) -> tuple[float, float]:
         with tempfile.TemporaryDirectory() as empty:
-            printed, told = _script(_FIRST_STEP, empty)
-        said.append(told)
+            printed, messages = _script(_FIRST_STEP, empty)
+        said.append(messages)
         return float(printed[0]), 1
 
     def script(text: str, cache: str) -> Callable[[int], tuple[float, float]]:

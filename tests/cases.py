@@ -1,4 +1,4 @@
-"""Records as people have them: a file for each, in the form of an instrument, and the right answer.
+"""Records as instruments write them: a file for each, and the correct answer.
 
 Each kind is a function that simulates a record by a method of its own, and writes it as its instrument would.
 """
@@ -29,7 +29,7 @@ LIGHT, HEAVY = (0.35, 0.8, 1800.0, 3e7), (0.9, 1.3, 7200.0, 9e7)
 
 @dataclass(frozen=True)
 class Made:
-    """What a user has, and does.
+    """A user's files and commands.
 
     Attributes:
         files: name to content, in the order in which they are given.
@@ -48,7 +48,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Case:
-    """A kind with numbers.
+    """A kind of record with numbers.
 
     Attributes:
         kind: name of the function that makes it.
@@ -95,7 +95,7 @@ def _label(name: str, value: Any) -> str:
 
 
 def answered(made: Made, folder: Path) -> Iterator[tuple[str, Result]]:
-    """What `identify` says at first, and each time that the rig was changed as it advises: a verdict, and the result.
+    """Verdict and result of `identify` at first, and after each change of the rig that it advises.
 
     The verdict is ``right``, ``named`` or ``silent``.
     """
@@ -123,7 +123,7 @@ def whole(written: str) -> float:
 
 
 def advised(rig: Rig, result: Result) -> Rig | None:
-    """The rig with the way of the input that a warning names; None where none does."""
+    """The rig with the interpolation and delay that a warning names; None where no warning names one."""
     for warning in result.warnings:
         if found := re.search(r"'(\w+)' with delay (\S+?)(?:, and a lag of (\S+) s)?, by", warning.message):
             lag = float(found[3]) if found[3] else None

@@ -1,4 +1,4 @@
-"""How tests play environments, and compare what these gave bit for bit."""
+"""How tests play environments, and compare the results bit for bit."""
 
 import copy
 import pickle

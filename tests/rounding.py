@@ -7,7 +7,7 @@ other's reference, and the bound holds for any two of them: each differs from th
   (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1), where u = 2⁻²⁴ is the unit of rounding;
 - tanh and the exponential: 4 units in the last place, which is what the vector libraries promise at their coarsest,
   8 u of the value;
-- what the inputs differ by, times the largest slope between them.
+- the difference of the inputs, times the largest slope between them.
 
 The network is played in float64 with the weights at hand, and the bound is carried along beside the values.
 """

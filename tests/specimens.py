@@ -54,7 +54,7 @@ MODELS = {
 
 
 class Difference:
-    """Eq. (2) without noise, for `VOLTS`; takes down what was asked of it."""
+    """Eq. (2) without noise, for `VOLTS`; it records its calls."""
 
     def __init__(self):
         self.inputs, self.resets = [], 0
@@ -70,7 +70,7 @@ class Difference:
 
 
 class Bench:
-    """Eq. (1) without noise in newtons and metres, for `RIG`, by the midpoint rule; takes down what it got and gave."""
+    """Eq. (1) without noise in newtons and metres, for `RIG`, by the midpoint rule; it records inputs and outputs."""
 
     truth = {"m": 0.42, "c": 0.5, "a": 2400.0, "b": 4e7}  # noqa: RUF012
 
@@ -139,7 +139,7 @@ class OnTheRecordVector(SilverboxReplayVectorEnv):
 
 
 def means(beliefs):
-    """An observation: what is believed of the coefficients, and the logarithms of their standard deviations."""
+    """An observation: means of the coefficients, and logarithms of their standard deviations."""
     stds = np.sqrt(np.diagonal(beliefs.coefficients_cov, axis1=1, axis2=2))
     return np.concatenate([beliefs.coefficients_mean, np.log(stds)], axis=1)
 

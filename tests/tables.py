@@ -1,4 +1,4 @@
-"""Tests of tables: one item, in which every row passes or fails by itself."""
+"""Table tests: one item, in which every row passes or fails by itself."""
 
 import inspect
 from collections.abc import Callable, Iterable

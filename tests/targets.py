@@ -1,4 +1,4 @@
-"""What Numba compiles for, which a setting may make another processor than that of the machine."""
+"""The processor that Numba compiles for, which a setting can make differ from the machine's."""
 
 import platform
 from functools import cache

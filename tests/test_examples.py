@@ -30,8 +30,8 @@ LIBRARY = {
 def in_a_process(name, *words):
     """Exit status and messages of an example that runs by itself."""
     command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *words]
-    told = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=told, capture_output=True, text=True, check=False)
+    variables = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     return done.returncode, done.stderr
 
 
@@ -85,15 +85,15 @@ def test_an_example_trains_a_policy_that_is_played_as_any_other(name, example, t
         (["--output", "run"], "output must be a folder for a policy, but run holds a run; remove it or name another"),
     ],
 )
-def test_what_an_example_cannot_do_is_one_line_before_it_trains(example, words, message):
+def test_an_unusable_option_of_an_example_is_one_line_before_training(example, words, message):
     Path("taken").write_text("")
     Path("run").mkdir(exist_ok=True)
     Path("run/config.json").write_text("{}")
     status, messages = example("cleanrl_ppo", *words)
     assert status == 2
-    told = [line for line in messages.splitlines() if "is compiling" not in line]  # as it says on a slow machine
-    assert len(told) == 1
-    assert message in told[0]
+    reported = [line for line in messages.splitlines() if "is compiling" not in line]  # as it says on a slow machine
+    assert len(reported) == 1
+    assert message in reported[0]
 
 
 @pytest.mark.parametrize(

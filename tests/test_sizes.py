@@ -45,7 +45,7 @@ def functions(path):
 
 
 def size_faults(function):
-    """What is too large about a function."""
+    """The limits that a function exceeds."""
     arguments = function.args
     named = [
         a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs) if a.arg not in ("self", "cls")
@@ -77,5 +77,5 @@ def test_no_function_is_too_long_but_those_that_are_named():
         ("def f(self, a, b, c, d, e, f, g, h, i, j): pass", []),
     ],
 )
-def test_what_is_too_large_is_found(source, found):
+def test_size_faults_are_found(source, found):
     assert size_faults(ast.parse(source).body[0]) == found

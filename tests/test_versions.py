@@ -1,4 +1,4 @@
-"""The Python versions that work are said the same everywhere, and the commands keep to them."""
+"""All places name the same Python versions, and the commands accept only these."""
 
 import importlib.util
 import os
@@ -35,7 +35,7 @@ def project(tmp_path: Path) -> Path:
 
 
 def python(folder: Path, version: str) -> Path:
-    """Something that says it is a Python of this version, and does nothing else."""
+    """A script that reports a Python version, and does nothing else."""
     path = folder / "stand-in"
     path.write_text(f"#!/bin/sh\necho {version}\n")
     path.chmod(0o755)
@@ -56,12 +56,12 @@ def test_versions_agree():
 
 
 @table("document", ["README.md", "docs/index.md"])
-def test_documents_say_which(document):
+def test_documents_name_the_versions(document):
     assert f"Python {VERSIONS[0]} to {VERSIONS[-1]} and make" in (ROOT / document).read_text()
 
 
 @table("target", ["demo", "test", "docs", "lint", "clean"])
-def test_make_says_which_first(project, target):
+def test_make_prints_the_version_first(project, target):
     assert make(project, "-n", target, f"PYTHON={python(project, VERSIONS[0])}").stdout.startswith(f"{WORKS}.\n")
 
 

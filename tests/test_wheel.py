@@ -41,12 +41,14 @@ print("played")
 
 
 def pythons():
-    """Version to Python, of those that the package is for: the one that runs the tests, and what is on the path."""
-    told = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["classifiers"]
-    versions = [word.split(" :: ")[-1] for word in told if word.startswith("Programming Language :: Python :: 3.")]
+    """Supported version to its Python: the one that runs the tests, and those on the path."""
+    classifiers = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["classifiers"]
+    versions = [
+        word.split(" :: ")[-1] for word in classifiers if word.startswith("Programming Language :: Python :: 3.")
+    ]
     found = {version: shutil.which(f"python{version}") for version in versions}
     found["{}.{}".format(*sys.version_info)] = sys.executable
-    # A name on the path may be that of a version that is not installed (pyenv).
+    # A name on the path may belong to a version that is not installed (pyenv).
     return {
         version: python if python and not subprocess.run([python, "-c", ""], capture_output=True).returncode else None
         for version, python in found.items()
@@ -69,7 +71,7 @@ def test_clean_installations_are_light_and_work(tmp_path):
 
 
 def installed_size(wheel, python, folder):
-    """MB of the wheel in an environment of its own, in which it has shown that it works."""
+    """Size [MB] of the wheel in an environment of its own, after its functions were tried there."""
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     folder.mkdir()
 

@@ -42,11 +42,11 @@ def main() -> int:
     for name in sys.argv[1:] or LIBRARIES:
         with tempfile.TemporaryDirectory() as folder:  # of Minari's data sets
             command = [sys.executable, "-m", "benchmarks.compat", "--row", name]
-            told = {**os.environ, "MINARI_DATASETS_PATH": folder}
-            done = subprocess.run(command, capture_output=True, text=True, check=False, env=told)
-        told = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else [name, *[done.stderr[-100:]] * 4]
-        failed += sum(each not in ("yes", "-") for each in told[1:])
-        print(f"| {' | '.join(told)} |", flush=True)
+            environment = {**os.environ, "MINARI_DATASETS_PATH": folder}
+            done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+        cells = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else [name, *[done.stderr[-100:]] * 4]
+        failed += sum(each not in ("yes", "-") for each in cells[1:])
+        print(f"| {' | '.join(cells)} |", flush=True)
     return failed
 
 

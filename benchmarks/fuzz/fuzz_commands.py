@@ -44,9 +44,9 @@ def calls() -> st.SearchStrategy[Call]:
         words = [*first, *draw(st.lists(st.one_of(st.sampled_from(_WORDS), st.text(max_size=5)), max_size=4))]
 
         def function() -> str:
-            told, errors = io.StringIO(), io.StringIO()
+            printed, errors = io.StringIO(), io.StringIO()
             status: object = 0
-            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(errors):
+            with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
                 try:
                     main(words)
                 except SystemExit as stop:
@@ -54,7 +54,7 @@ def calls() -> st.SearchStrategy[Call]:
             said = errors.getvalue()
             if "Traceback" in said or status not in (0, 1, 2, None):
                 return f"status {status}: {said[:200]}"
-            return "status 2 without a word" if status == 2 and not (said or told.getvalue()).strip() else ""
+            return "status 2 without a word" if status == 2 and not (said or printed.getvalue()).strip() else ""
 
         return Call(f"duffing-env {' '.join(first)}", function, ("must",), sound=str)
 

@@ -81,7 +81,7 @@ def calls() -> st.SearchStrategy[Call]:
         name = draw(st.sampled_from(list(MADE)))
         estimator: OnlineEstimator = pickle.loads(pool[name])
         method = draw(st.sampled_from(["update", "run", "run", "predict", "forecast", "simulate", "restore", "belief"]))
-        told: Any = None
+        data: Any = None
         names: tuple[str, ...] = ("u", "y", "missing", "interpolation", "y_init")
         if method == "update":
             u, y = draw(series(1)), draw(series(1))
@@ -107,11 +107,11 @@ def calls() -> st.SearchStrategy[Call]:
             size = draw(st.integers(0, 12))
             other = size if draw(st.integers(0, 5)) else draw(st.integers(0, 12))
             u, y = draw(series(size)), draw(series(other))
-            told = (u, y)
+            data = (u, y)
             more = {"missing": True} if method == "run" and draw(st.booleans()) else {}
             function = lambda: getattr(estimator, method)(u, y, **more)  # noqa: E731
         return Call(
-            f"{name}: {method}", function, names, lambda: _state(estimator), lambda result: sound(estimator), told
+            f"{name}: {method}", function, names, lambda: _state(estimator), lambda result: sound(estimator), data
         )
 
     return call()

@@ -68,20 +68,27 @@ def main(config: Config) -> None:
         if case.missing:
             rows.append([name, "0", f"left out: {case.missing}", "", "", ""])
             continue
-        told = found[name]
-        equal = f"{told['equal']} of {told['kills']}" if case.promises else "not promised"
-        lost = f"{told['lost']:g} {case.unit}"
+        counts = found[name]
+        equal = f"{counts['equal']} of {counts['kills']}" if case.promises else "not promised"
+        lost = f"{counts['lost']:g} {case.unit}"
         rows.append(
-            [name, str(told["kills"]), lost, str(told["half-written"]), f"{told['resumed']} of {told['kills']}", equal]
+            [
+                name,
+                str(counts["kills"]),
+                lost,
+                str(counts["half-written"]),
+                f"{counts['resumed']} of {counts['kills']}",
+                equal,
+            ]
         )
     heads = ("command", "kills", "lost at most", "half-written files", "goes on", "equal")
     print_texts_and_tables(format_table(heads, rows, markdown=True))
-    for told in found.values():
-        for fault in told["faults"]:
+    for counts in found.values():
+        for fault in counts["faults"]:
             print(fault, file=sys.stderr)
     if config.json is not None:
         write_json(config.json, found)
-    sys.exit(any(told["faults"] for told in found.values()))
+    sys.exit(any(counts["faults"] for counts in found.values()))
 
 
 def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -92,7 +99,7 @@ def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[s
     began = time.time()
     _finish(case, whole, case.start(whole), "undisturbed")
     times = _times(whole, began)
-    told: Counter[str] = Counter(kills=kills)
+    counts: Counter[str] = Counter(kills=kills)
     lost, faults = 0.0, []
     for k in range(kills):
         folder = base / str(k)
@@ -100,22 +107,22 @@ def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[s
         bad = half_written(folder)
         measured = case.measured(folder)
         lost = max(lost, case.lost(folder))
-        told["half-written"] += len(bad)
+        counts["half-written"] += len(bad)
         faults += [f"{case.name}, kill {k}: {path} is half-written: {why}" for path, why in bad]
         try:
             _finish(case, folder, case.again(folder), f"kill {k}")
-            told["resumed"] += 1
+            counts["resumed"] += 1
             gone = [what for what in measured if what not in case.measured(folder)]
             faults += [f"{case.name}, kill {k}: what was measured is gone: {gone}"] if gone else []
             same = not case.promises or case.result(folder) == case.result(whole)
-            told["equal"] += same
+            counts["equal"] += same
             faults += [] if same else [f"{case.name}, kill {k}: the result differs from the undisturbed command's"]
         except RuntimeError as error:
             faults.append(f"{case.name}: {error}")
         shutil.rmtree(folder)
     if lost > case.most:
         faults.append(f"{case.name}: {lost:g} {case.unit} were lost, more than {case.most:g}")
-    return {"kills": 0, "half-written": 0, "resumed": 0, "equal": 0, **told, "lost": lost, "faults": faults}
+    return {"kills": 0, "half-written": 0, "resumed": 0, "equal": 0, **counts, "lost": lost, "faults": faults}
 
 
 def _times(folder: Path, began: float) -> list[float]:

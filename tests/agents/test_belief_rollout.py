@@ -1,4 +1,4 @@
-"""Imagination: against plain NumPy references for three models, its costs, and what lost numbers are worth."""
+"""Belief rollouts: against plain NumPy references for three models, their costs, and scores of diverged plans."""
 
 from dataclasses import replace
 
@@ -116,7 +116,7 @@ def random_belief(model, rng):
 def expected(case, belief, u, last, walk):
     """The belief's mean and covariance after inputs u (T,) whose outputs are as predicted.
 
-    And the variance by which the first sensor's output before the last one moves what is expected of that.
+    The last value is the variance that the first sensor's previous output adds to the prediction of its last one.
     """
     model, _, move, seen = CASES[case]
     n = model.n_states
@@ -144,20 +144,20 @@ def terms(model, **others):
     return PlanObjective(**{**values, "scales": np.ones(model.n_states), **others})
 
 
-def block_after(model, degree, belief, u, told, last=0.0):
-    """The block of a mind after inputs u (T, LANES), and the mind."""
+def block_after(model, degree, belief, u, objective, last=0.0):
+    """The block of a belief rollout after inputs u (T, LANES), and the rollout."""
     found = compile_belief_rollout(model, degree)
     W = np.zeros(found.size)
     found.load_belief(W, belief.record.copy(), np.array([last, 0.0]))
     for inputs in u:
         W[found.input_row : found.input_row + LANES] = inputs
-        found.advance(W, belief.record.copy(), told)
+        found.advance(W, belief.record.copy(), objective)
     return W.reshape(-1, LANES), found
 
 
 @pytest.mark.parametrize("case", CASES)
 @table("walks", [False, True])
-def test_imagination_is_the_plain_recursion(case, walks):
+def test_a_belief_rollout_equals_the_plain_recursion(case, walks):
     model, degree, *_ = CASES[case]
     rng = np.random.default_rng(0)
     belief = random_belief(model, rng)
@@ -189,14 +189,14 @@ def test_imagination_is_the_plain_recursion(case, walks):
 def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limit(case, limit, firm):
     model, degree, *_ = CASES[case]
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(
+    objective = terms(
         model, limit=limit, input_weight=3.0, goal=0.1, goal_weight=4.0, accumulated_noise=5.0, hard_margin=firm
     )
-    W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), told)
+    W, _ = block_after(model, degree, belief, np.full((1, LANES), 0.1), objective)
     place = compile_expected_update(model, degree).layout
     shown, variance = W[place["Y_PRED"], 0], W[place["S_PRED"], 0]
     assert W[place["PENDING_VARIANCE"], 0] == 0.0  # the output before the first sample has been seen
-    # Five times what process noise does in a sample comes to it; but at most half of the limit is kept from it.
+    # The margin contains five standard deviations of a sample's process noise, and is at most half of the limit.
     deviation = np.sqrt(variance + 5.0 * 0.01**2)
     within = abs(shown) + min(2.0 * deviation, 0.5 * limit) - limit
     assert within > 0
@@ -208,12 +208,12 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
 
 
 @table("reach", [0.0, 0.05, -0.05, 10.0])
-def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach):
+def test_the_previous_output_is_compensated_by_a_harder_braking_input(reach):
     model = duffing()
     belief = random_belief(model, np.random.default_rng(1))
-    told = terms(model, limit=1.0, margin=3.0, recoverable_step=reach)
+    objective = terms(model, limit=1.0, margin=3.0, recoverable_step=reach)
     u = np.stack([np.full(LANES, 0.1), np.linspace(-0.15, 0.15, LANES)])
-    W, _ = block_after(model, 0, belief, u, told)
+    W, _ = block_after(model, 0, belief, u, objective)
     place = compile_expected_update(model, 0).layout
     shown, alone, surprise = (W[place[row]] for row in ("Y_PRED", "S_PRED", "PENDING_VARIANCE"))
     assert (surprise > 0).all()
@@ -225,7 +225,7 @@ def test_what_the_output_before_tells_is_made_up_for_by_what_brakes_harder(reach
     assert (wide < 0.5).any()
 
 
-def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
+def test_the_score_of_a_whole_plan_equals_the_belief_rollouts():
     # Kalman's separation of state and parameters: -½ log det C_H of the joint recursion is ½ log det(Λ + F).
     model = difference()
     belief = random_belief(model, np.random.default_rng(2))
@@ -240,7 +240,7 @@ def test_the_worth_of_a_whole_plan_is_what_imagination_says_too():
     assert value == pytest.approx(W[compile_expected_update(model).layout["SCORE"], 0], abs=1e-6)
 
 
-def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
+def test_a_diverged_plan_is_lost_and_leaves_the_others_unchanged():
     model = difference()
     belief = SimulatedExperiment().prior_belief
     u = np.full((40, LANES), 0.01)
@@ -254,8 +254,8 @@ def test_what_has_blown_up_is_lost_and_leaves_the_other_plans_alone():
     assert others[0] > 0
 
 
-def test_an_output_of_a_fast_swing_is_imagined_within_the_noise():
-    """Four steps are; two are not, of a swing of 0.6 V with five samples in a period, and a usual noise of 0.5 mV."""
+def test_an_output_of_a_fast_oscillation_is_predicted_within_the_noise():
+    """Four integration steps are enough and two are not, for 0.6 V with five samples per period and 0.5 mV of noise."""
     stiffness, cubic = 0.9, 3.5
     p, x = np.array([stiffness, cubic, 0.08, 0.54]), np.linspace(-0.6, 0.6, 61)
     v = np.sqrt(np.maximum(0.0, stiffness * (0.6**2 - x**2) + cubic / 2 * (0.6**4 - x**4)))
@@ -315,6 +315,6 @@ def test_one_state_is_enough():
 
 
 @table(("model", "degree", "lag"), [(difference(), 2, 0), (difference(), 0, 2), (duffing(), 1, 1)])
-def test_what_has_no_meaning_is_refused(model, degree, lag):
+def test_meaningless_arguments_are_refused(model, degree, lag):
     with pytest.raises(ValueError, match="degree and lag must be 0 or 1"):
         compile_expected_update(model, degree, lag)

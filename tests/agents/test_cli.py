@@ -46,9 +46,9 @@ def script(tmp_path, monkeypatch, capsys):
             runpy.run_path(str(ROOT / name), run_name="__main__")
         except SystemExit as stop:
             status = stop.code
-        told, said = capsys.readouterr()
+        printed, said = capsys.readouterr()
         # What is wrong with a value stands in a box, broken into lines.
-        return status, told, " ".join(said.replace("│", " ").replace("|", " ").split()) if "----" in said else said
+        return status, printed, " ".join(said.replace("│", " ").replace("|", " ").split()) if "----" in said else said
 
     return run
 
@@ -65,10 +65,10 @@ def declared_options(file, name):
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_help_explains_every_option(script, name):
-    status, told, messages = script(name, "--help")
+    status, printed, messages = script(name, "--help")
     assert (status, messages) == (0, "")
-    assert max(map(len, told.splitlines())) <= 80
-    lines = [line.strip("│ ") for line in told.splitlines()]
+    assert max(map(len, printed.splitlines())) <= 80
+    lines = [line.strip("│ ") for line in printed.splitlines()]
     begins = [i for i, line in enumerate(lines) if line.startswith("-") or set(line) & set("╭╰")]
     explained = 0
     for file, cls, prefix in DECLARED[name]:
@@ -141,7 +141,7 @@ def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
 
 
 def test_a_bad_value_shows_no_traceback(tmp_path):
-    """In a process of its own, with whatever is told before."""
+    """In a process of its own, whatever is printed before."""
     finished = subprocess.run(
         [sys.executable, ROOT / "evaluate.py", "--policies", "foo"],
         env=os.environ | {"COLUMNS": "400"}, capture_output=True, text=True, timeout=600, cwd=tmp_path,
@@ -154,10 +154,10 @@ def test_a_bad_value_shows_no_traceback(tmp_path):
 
 
 def test_a_bad_reward_is_one_line(script, tmp_path):
-    status, told, messages = script("train.py", "--reward", "foo")
+    status, printed, messages = script("train.py", "--reward", "foo")
     assert status == 2
     note = "An update takes 32,768 samples, so 5,013,504 will be learned from, not 5,000,000."
-    assert " ".join(told.split()) == note
+    assert " ".join(printed.split()) == note
     (line,) = (line for line in messages.splitlines() if not line.startswith("duffing-env is compiling"))
     assert line.startswith("train.py: ")
     assert "'foo'" in line
@@ -193,8 +193,8 @@ def test_figures_are_left_out_without_matplotlib(script, monkeypatch, tmp_path):
 @pytest.mark.parametrize("name", ["train.py", "evaluate.py"])
 def test_examples_in_the_help_keep_lines_of_their_own(script, name, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    _, told, _ = script(name, "--help")
-    lines = [line.strip() for line in told.splitlines() if "duffing-env " in line]
+    _, printed, _ = script(name, "--help")
+    lines = [line.strip() for line in printed.splitlines() if "duffing-env " in line]
     assert len(lines) >= 7
     assert all(line.startswith("$ duffing-env ") and line.count("$") == 1 and len(line) < 80 for line in lines)
 
@@ -203,10 +203,10 @@ def test_the_list_of_commands_has_no_examples_that_would_be_broken(monkeypatch, 
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
         main(["--help"])
-    told = capsys.readouterr().out
-    assert "$" not in told
-    assert "• evaluate  Compare policies on common random numbers" in told
-    assert "• rig       Describe your rig in a file" in told
+    printed = capsys.readouterr().out
+    assert "$" not in printed
+    assert "• evaluate  Compare policies on common random numbers" in printed
+    assert "• rig       Describe your rig in a file" in printed
 
 
 def test_help_of_the_command_is_quick():
@@ -243,8 +243,8 @@ def test_the_module_that_registers_a_track_may_stand_before_its_id(script, tmp_p
     env = "own_of_tests:mine/OfTests-v0"
     status, _, messages = script("evaluate.py", "--env", env, "--policies", "uniform", "--systems", 2)
     assert status == 0, messages
-    told = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
-    assert told["settings"]["env"] == env
+    document = json.loads((tmp_path / "runs" / "evaluation" / "evaluation.json").read_text())
+    assert document["settings"]["env"] == env
     config = TrainConfig(env=env)
     assert (config.env, track_name(config.env)) == (env, "OfTests-v0")
     assert TrainConfig(env="duffing_env:duffing_env/Short-v0") == TrainConfig(env="Short-v0")
@@ -255,7 +255,7 @@ def test_the_module_that_registers_a_track_may_stand_before_its_id(script, tmp_p
 
 def test_train_then_evaluate(script, tmp_path):
     """The way through both scripts: a policy that one wrote, the other compares."""
-    status, told, messages = script(
+    status, printed, messages = script(
         "train.py", "--steps", 512, "--seed", 4, "--options", '{"horizon": 32}', "--output", "made", "--systems", 4,
         "--torch-threads", 1, "--ppo.num-envs", 16, "--ppo.n-steps", 16, "--ppo.batch-size", 128, "--ppo.hidden", 6, 5,
     )  # fmt: skip
@@ -266,17 +266,17 @@ def test_train_then_evaluate(script, tmp_path):
     assert " ".join(said) == (
         "duffing-env: warning: a training of 2 updates may leave a policy worse than it began; take more steps than 512"
     )
-    assert max(map(len, (*lines, *told.splitlines()))) <= 80
-    assert "The run is in made" in told
+    assert max(map(len, (*lines, *printed.splitlines()))) <= 80
+    assert "The run is in made" in printed
     made = {path.name for path in (tmp_path / "made").iterdir()}
     pictures = {"contraction.png", "excitations.png", "learning_curve.png"}
     assert made == pictures | {
         "checkpoints", "config.json", "evaluation.json", "policy.json", "policy.safetensors", "progress.csv",
         "untrained",
     }  # fmt: skip
-    assert any(line.startswith("shield ") for line in told.splitlines())
+    assert any(line.startswith("shield ") for line in printed.splitlines())
     for name in (*pictures, "evaluation.json"):
-        assert str(Path("made") / name) in told.splitlines()
+        assert str(Path("made") / name) in printed.splitlines()
     description = json.loads((tmp_path / "made" / "config.json").read_text())
     assert description["config"]["options"] == {"horizon": 32}
     assert description["config"]["hyperparameters"]["hidden"] == [6, 5]

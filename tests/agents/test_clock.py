@@ -1,4 +1,4 @@
-"""A clock that is set back, or forward: durations are of the clock that cannot be."""
+"""A wall clock that is set back or forward: durations come from the monotonic clock."""
 
 import csv
 import itertools

@@ -69,27 +69,27 @@ def run(monkeypatch, capsys):
 
 def test_from_a_record_to_its_parameters(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    status, told, _ = run("rig", "init", "rig.toml", "--from", "record.csv")
+    status, printed, _ = run("rig", "init", "rig.toml", "--from", "record.csv")
     assert status == 0
-    assert "The sampling step is 0.001 s (1000 Hz), by the times in time [ms]." in told
-    assert "The output is in mm, and converted to m" in told
+    assert "The sampling step is 0.001 s (1000 Hz), by the times in time [ms]." in printed
+    assert "The output is in mm, and converted to m" in printed
     rig = Rig.from_file("rig.toml")
     assert (rig.step, rig.input.unit, rig.output.unit, rig.output.kind) == (1e-3, "N", "m", "displacement")
-    status, told, _ = run("identify", "rig.toml", "record.csv", "--report", "out/page.html")
+    status, printed, _ = run("identify", "rig.toml", "record.csv", "--report", "out/page.html")
     assert status == 0
-    (row,) = [line.split() for line in told.splitlines() if line.split()[:1] == ["m"] and " to " in line]
+    (row,) = [line.split() for line in printed.splitlines() if line.split()[:1] == ["m"] and " to " in line]
     assert float(row[1]) == pytest.approx(0.4, rel=0.01)
     assert row[-1] == "kg"
-    assert "The sampling step is 0.001 s (1000 Hz) by the rig, and the times agree." in told
-    assert "No check speaks against this result." in told
+    assert "The sampling step is 0.001 s (1000 Hz) by the rig, and the times agree." in printed
+    assert "No check speaks against this result." in printed
     page = Path("out/page.html").read_text()
     assert "duffing-env identify rig.toml record.csv --report out/page.html" in page
     lines = Path("record.csv").read_text().splitlines()
     Path("first.csv").write_text("\n".join(lines[:600]))
     Path("second.csv").write_text("\n".join([lines[0], *lines[600:]]))
-    status, told, _ = run("identify", "rig.toml", "first.csv", "second.csv", "--json")
+    status, printed, _ = run("identify", "rig.toml", "first.csv", "second.csv", "--json")
     assert status == 0
-    described = json.loads(told)
+    described = json.loads(printed)
     assert [one["samples"] for one in described["records"]] == [599, 425]
     for name, truth in TRUTH.items():
         found = described["parameters"][name]
@@ -103,35 +103,35 @@ def test_columns_of_any_name_are_named_once(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     _, *lines = Path("record.csv").read_text().splitlines()
     Path("channels.csv").write_text("\n".join(["Zeit [ms],CH1 [N],CH2 [mm]", *lines]))
-    status, told, _ = run("rig", "init", "unit.toml", "--from", "channels.csv")
+    status, printed, _ = run("rig", "init", "unit.toml", "--from", "channels.csv")
     assert status == 0
-    assert "Input: CH1 [N]; output: CH2 [mm], a displacement (by their units)." in told
+    assert "Input: CH1 [N]; output: CH2 [mm], a displacement (by their units)." in printed
     taken = Rig.from_file("unit.toml")
     assert (taken.input.column, taken.output.column) == ("CH1 [N]", "CH2 [mm]")
     Path("daten.csv").write_text("\n".join(["Zeit [ms],Kraft [N],Weg [mm]", *lines]))
-    status, told, _ = run("rig", "init", "name.toml", "--from", "daten.csv")
+    status, printed, _ = run("rig", "init", "name.toml", "--from", "daten.csv")
     assert status == 0
-    assert "Input: Kraft [N]; output: Weg [mm], a displacement (by their names)." in told
+    assert "Input: Kraft [N]; output: Weg [mm], a displacement (by their names)." in printed
     taken = Rig.from_file("name.toml")
     assert (taken.input.column, taken.output.column) == (None, None)
     Path("four.csv").write_text("\n".join(["Zeit [ms],CH1 [V],CH2 [V],CH3 [A]", *(f"{one},0" for one in lines)]))
-    status, _, told = run("rig", "init", "hart.toml", "--from", "four.csv")
+    status, _, printed = run("rig", "init", "hart.toml", "--from", "four.csv")
     assert status == 2
-    assert "name both by --input and --output of duffing-env rig init" in told
+    assert "name both by --input and --output of duffing-env rig init" in printed
     assert run("rig", "init", "hart.toml", "--from", "daten.csv", "--input", "Kraft", "--output", "Weg")[0] == 0
     rig = Rig.from_file("hart.toml")
     assert (rig.input.column, rig.output.column, rig.output.unit) == ("Kraft", "Weg", "m")
-    status, told, _ = run("identify", "hart.toml", "daten.csv", "--json")
-    assert json.loads(told)["parameters"]["m"]["mean"] == pytest.approx(0.4, rel=0.01)
+    status, printed, _ = run("identify", "hart.toml", "daten.csv", "--json")
+    assert json.loads(printed)["parameters"]["m"]["mean"] == pytest.approx(0.4, rel=0.01)
 
 
-def test_warnings_are_told(run, folder, monkeypatch):
+def test_warnings_are_printed(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     Path("late.toml").write_text('step = 1e-3\ndelay = 1\n[input]\nunit = "N"\n[output]\nunit = "mm"\n')
-    status, told, _ = run("identify", "late.toml", "record.csv")
+    status, printed, _ = run("identify", "late.toml", "record.csv")
     assert status == 0
-    assert "delay: " in told
-    assert "No check speaks" not in told
+    assert "delay: " in printed
+    assert "No check speaks" not in printed
 
 
 @table(
@@ -168,8 +168,8 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
     Path("kind.csv").write_text("t,u,displacement [m/s]\n0,1,2\n1,1,2\n2,2,3\n")
     Path("r.mat").write_bytes(b"none")
     Path("fortnights.csv").write_text("t [fortnight],u,y\n0,1,2\n1,1,2\n2,2,3\n")
-    status, told, messages = run(*words)
-    assert (status, told) == (2, "")
+    status, printed, messages = run(*words)
+    assert (status, printed) == (2, "")
     (line,) = messages.splitlines()
     assert line.startswith("duffing-env: ")
     assert message in line
@@ -187,14 +187,14 @@ def test_a_user_s_error_is_one_line_and_exit_status_2(run, tmp_path, monkeypatch
         ("time,input,response [deg]", 1.6384, ("1", "rad"), "displacement"),
     ],
 )
-def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step, units, kind):
+def test_a_rig_takes_step_and_units_from_a_record(run, tmp_path, monkeypatch, head, step, units, kind):
     monkeypatch.chdir(tmp_path)
     fields = [(f"{1.6384 * k:.6f}", f"{k % 3}", f"{k % 5}") for k in range(2000)]
     rows = [",".join(row if head.startswith("t") else row[::-1]) for row in fields]
     Path("r.csv").write_text("\n".join([head, *rows]))
-    status, told, _ = run("rig", "init", "--from", "r.csv")
+    status, printed, _ = run("rig", "init", "--from", "r.csv")
     assert status == 0
-    assert "Next: duffing-env identify rig.toml r.csv" in told
+    assert "Next: duffing-env identify rig.toml r.csv" in printed
     rig = Rig.from_file("rig.toml")
     assert rig == Rig(rig.step, input={"unit": units[0]}, output={"unit": units[1], "kind": kind})
     assert ("just before the input changes" in Path("rig.toml").read_text()) == (kind == "acceleration")
@@ -204,9 +204,9 @@ def test_a_rig_takes_what_a_record_tells(run, tmp_path, monkeypatch, head, step,
 def test_a_step_can_be_given(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("a record.csv").write_text("1 2\n2 3\n3 4\n")
-    status, told, _ = run("rig", "init", "--from", "a record.csv", "--step", "2e-6")
+    status, printed, _ = run("rig", "init", "--from", "a record.csv", "--step", "2e-6")
     assert status == 0
-    assert "Next: duffing-env identify rig.toml 'a record.csv'" in told
+    assert "Next: duffing-env identify rig.toml 'a record.csv'" in printed
     assert Rig.from_file("rig.toml") == Rig(2e-6)
 
 
@@ -215,19 +215,19 @@ def test_a_mat_file_can_be_the_record(run, tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     savemat("r.mat", {"u": np.arange(9.0), "y": np.arange(9.0) ** 2})
-    status, told, _ = run("rig", "init", "--from", "r.mat", "--step", "2e-3")
+    status, printed, _ = run("rig", "init", "--from", "r.mat", "--step", "2e-3")
     assert status == 0
-    assert "Next: duffing-env identify rig.toml r.mat" in told
+    assert "Next: duffing-env identify rig.toml r.mat" in printed
     assert Rig.from_file("rig.toml") == Rig(2e-3)
 
 
-def test_a_rig_is_asked_for(run, tmp_path, monkeypatch, capsys):
+def test_a_rig_is_made_from_answers(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     answers = ["fast", "-3", "500 Hz", "stairs", "linear", "mN", "20", "speed", "velocity", "mm/s", "", "-1 2", "2 1",
                "0.3 0.5", "0.1, 2", "1e3 5e3", "-1e8 1e8"]  # fmt: skip
-    status, told, _ = run("rig", "init", answers=answers)
+    status, printed, _ = run("rig", "init", answers=answers)
     assert status == 0
-    assert [line.strip() for line in told.splitlines() if line.startswith("  ")] == [
+    assert [line.strip() for line in printed.splitlines() if line.startswith("  ")] == [
         "must be a number, but is 'fast'",
         "must be positive, but is -3",
         "must be one of zero_order, linear, look_ahead, spline, but is stairs",
@@ -262,21 +262,21 @@ def test_a_rig_that_ships_is_listed_and_copied(run, tmp_path, monkeypatch, name)
 
 
 def test_help_has_examples_on_lines_of_their_own_and_names_every_argument(run):
-    status, told, _ = run("--help")
+    status, printed, _ = run("--help")
     assert status == 0
-    assert "identify" in told
-    assert "rig" in told
+    assert "identify" in printed
+    assert "rig" in printed
     for words, arguments in (
         (["identify"], ["RIG", "DATA", "--report PATH", "--json"]),
         (["rig", "init"], ["--from DATA|NAME", "--step SECONDS", "--force"]),
         (["rig", "list"], []),
     ):
-        status, told, _ = run(*words, "--help")
+        status, printed, _ = run(*words, "--help")
         assert status == 0
-        lines = [line.strip() for line in told.splitlines()]
+        lines = [line.strip() for line in printed.splitlines()]
         assert any(line.startswith(f"$ duffing-env {' '.join(words)}") for line in lines)
         assert all(line.count("duffing-env ") <= 1 for line in lines)
-        assert all(argument in told for argument in arguments)
+        assert all(argument in printed for argument in arguments)
 
 
 @pytest.mark.parametrize("columns", ["80", "300"])
@@ -285,16 +285,16 @@ def test_no_line_of_a_help_is_wider_than_80_characters(run, monkeypatch, subtest
     commands = ("identify", "design", "run", "train", "evaluate", "export", "report", "rig", "rig init", "rig list")
     for words in ("", *commands):
         with subtests.test(words):
-            status, told, _ = run(*words.split(), "--help")
+            status, printed, _ = run(*words.split(), "--help")
             assert status == 0
-            assert max(map(len, told.splitlines())) <= 80
+            assert max(map(len, printed.splitlines())) <= 80
 
 
 def test_no_line_of_a_table_is_wider_than_80_characters(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in (["report"], ["rig", "list"]):
-        told = run(*words)[1]
-        assert max(map(len, told.splitlines())) <= 80
+        printed = run(*words)[1]
+        assert max(map(len, printed.splitlines())) <= 80
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signal")
@@ -318,5 +318,5 @@ def test_a_signal_is_one_line_and_its_exit_status(tmp_path, number, status):
 
 
 def test_what_can_be_left_out_stands_in_brackets(run):
-    _, told, _ = run("design", "--help")
-    assert "RIG [POSTERIOR]" in told
+    _, printed, _ = run("design", "--help")
+    assert "RIG [POSTERIOR]" in printed

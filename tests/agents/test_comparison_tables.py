@@ -1,4 +1,4 @@
-"""The leaderboard: intervals, table, JSON and figures, from evaluations whose figures are known."""
+"""The leaderboard: intervals, table, JSON and figures, from evaluations with known metrics."""
 
 import json
 from dataclasses import asdict, replace
@@ -229,8 +229,8 @@ def test_the_two_way_table_has_a_row_for_each_policy_and_estimator(capsys):
 def test_a_rigs_table_and_figure_are_in_its_units():
     newtons = Scales(1e-3, input=20.0, output=0.03, input_unit="N", output_unit="m")
     values = {"input_power": [90.25, 110.25], "input_peak": [19.0, 20.0], "log_posterior_gain": [1.0, 2.0]}
-    told = {name: np.array(value) for name, value in values.items()}
-    evaluation = replace(make_evaluation(systems=2, **told), scales=newtons)
+    metrics = {name: np.array(value) for name, value in values.items()}
+    evaluation = replace(make_evaluation(systems=2, **metrics), scales=newtons)
     _, rows = comparison_table([evaluation])
     cells = {title: cell.split("\n")[0] for title, cell in rows}
     assert cells["input power / N²"] == "100.2"

@@ -20,9 +20,9 @@ def test_a_table_that_is_too_wide_is_several_with_the_same_labels(capsys, monkey
     print_texts_and_tables(format_table(WORDS, rows, markdown=markdown, title="once"))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= min(80, int(columns))
-    told = "\n".join(lines)
-    assert told.count("once") == 1
-    assert all(str(number) in told for number in range(1000, 1029))
+    printed = "\n".join(lines)
+    assert printed.count("once") == 1
+    assert all(str(number) in printed for number in range(1000, 1029))
     if markdown:
         heads = [cell.strip() for line in lines if WORDS[0] in line for cell in line.strip().strip("|").split("|")]
         assert [head for head in heads if head != WORDS[0]] == WORDS[1:]
@@ -45,13 +45,13 @@ def test_letters_that_an_encoding_lacks_are_spelled(encoding, monkeypatch):
     with one_line_errors("x"):
         print_texts_and_tables(text, format_table(("", "mean"), [["c", "1 N s/mm³"]]))
     stream.flush()
-    told = stream.buffer.getvalue().decode(encoding)
+    printed = stream.buffer.getvalue().decode(encoding)
     if encoding == "utf-8":
-        assert told.startswith(text)
+        assert printed.startswith(text)
     if encoding == "ascii":
-        assert told.startswith("m x'' + b x^3 +/- gamma N s^2/mm e ? ...\n")
-        assert "1 N s/mm^3" in told
-        assert "-----" in told
+        assert printed.startswith("m x'' + b x^3 +/- gamma N s^2/mm e ? ...\n")
+        assert "1 N s/mm^3" in printed
+        assert "-----" in printed
 
 
 def test_a_command_ends_well_on_a_terminal_of_ascii(tmp_path):

@@ -25,7 +25,7 @@ SHORT = {"env_id": "duffing_env/Short-v0", "systems": 4, "options": {"horizon": 
 
 
 class Push:
-    """Pushes as hard as it is told, one way."""
+    """Applies a constant input."""
 
     def __init__(self, seed, strength=1.0):
         self.seed, self.strength = seed, strength
@@ -125,27 +125,27 @@ class Picky:
         raise ValueError("observation must have 35 entries")
 
 
-def test_what_a_policy_refuses_is_told_with_its_name(monkeypatch):
-    told = r"policy Forgetful must have predict\(observation, .*, but its predict is \(observation, state=None\)"
-    with pytest.raises(ValueError, match=told):
+def test_an_error_of_a_policy_names_the_policy(monkeypatch):
+    message = r"policy Forgetful must have predict\(observation, .*, but its predict is \(observation, state=None\)"
+    with pytest.raises(ValueError, match=message):
         evaluate_policies([Forgetful()], **SHORT)
     with pytest.raises(ValueError, match="policy Picky does not play duffing_env/Short-v0: observation must have 35"):
         evaluate_policies([Picky()], **SHORT)
 
 
 @table(
-    ("actions", "told"),
+    ("actions", "message"),
     [
         (np.full((4, 1), np.nan, dtype=np.float32), "must be finite, but row 0 is nan"),
         (np.zeros(4, dtype=np.float32), r"must have shape \(4, 1\), but have \(4,\)"),
     ],
 )
-def test_whose_actions_are_none_is_told_with_its_name(actions, told):
+def test_invalid_actions_name_the_policy(actions, message):
     class Broken(Push):
         def predict(self, observation, state=None, episode_start=None, deterministic=False):
             return actions, state
 
-    with pytest.raises(ValueError, match=f"policy Broken does not play duffing_env/Short-v0: actions {told}"):
+    with pytest.raises(ValueError, match=f"policy Broken does not play duffing_env/Short-v0: actions {message}"):
         evaluate_policies([Broken(0.5)], **SHORT)
 
 
@@ -199,7 +199,7 @@ def test_a_wrapper_that_is_not_written_is_refused(tmp_path):
 
 
 class Halved(gym.ActionWrapper):
-    """Pushes half as hard."""
+    """Halves every action."""
 
     def action(self, action):
         return action / 2
@@ -239,12 +239,12 @@ def normalised(env):
 )
 def test_a_wrapper_of_gymnasium_that_would_not_be_played_is_refused(tmp_path, wrap, name):
     model = PPO("MlpPolicy", wrap(gym.make("duffing_env/Short-v0")), device="cpu")
-    told = (
+    message = (
         f"model must see its environment as it is or through VecNormalize, but it is wrapped in {name}; train without"
     )
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         save_policy(tmp_path / "mine", model)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         make_policy(model)
     assert list(tmp_path.iterdir()) == []
 
@@ -360,9 +360,9 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, kind):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_network_for_other_observations_is_told_with_its_name():
-    told = r"policy Sequential does not play duffing_env/Short-v0: it must take observations of shape \(4, 22\), but"
-    with pytest.raises(ValueError, match=told):
+def test_a_network_for_other_observations_is_refused_by_name():
+    message = r"policy Sequential does not play duffing_env/Short-v0: it must take observations of shape \(4, 22\), but"
+    with pytest.raises(ValueError, match=message):
         evaluate_policies([torch.nn.Sequential(torch.nn.Linear(10, 1))], **SHORT)
 
 
@@ -384,10 +384,10 @@ def test_a_policy_plays_the_observation_that_it_learned_from(tmp_path, how):
     else:
         card = {"observation": "history"} if how == "card" else {"config": {"options": HISTORY}}
         save_policy(mine, sequence(), card)
-    told = (
+    message = (
         r"mine: env must show the observation 'history', which the policy learned from, but shows 'posterior'; make it"
     )
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         evaluate_policies([mine], **SHORT)
     (found,) = evaluate_policies([mine], SHORT["env_id"], 4, options={"horizon": 6, **HISTORY})
     assert np.isfinite(found.inputs).all()
@@ -522,7 +522,7 @@ def test_a_normaliser_beside_an_algorithm_is_refused(tmp_path):
         (".:policy", "cannot be imported"),
     ],
 )
-def test_what_is_no_policy_is_refused_in_a_sentence(policy, message, tmp_path, monkeypatch):
+def test_an_invalid_policy_gives_one_sentence(policy, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken_of_tests.py").write_text("policy = (\n")
     (tmp_path / "leaving_of_tests.py").write_text("raise SystemExit(3)\n")

@@ -1,4 +1,4 @@
-"""The worth of inputs to any model and its gradient: against the Fisher information, differences, and the limits."""
+"""The D-optimality of inputs to any model and its gradient: against the Fisher information, differences and limits."""
 
 import sys
 from pathlib import Path
@@ -26,11 +26,11 @@ TWIN = NominalSystem(THETA, PRECISION, (Q**2, R**2))
 
 
 def evaluated(u, start=None, penalty=0.0, climbs=False, limit=LIMIT, known=TWIN, found=None):
-    """Worth and peak, or worth, peak and gradient."""
+    """Criterion and peak, or criterion, peak and gradient."""
     found = found or compile_d_optimality(PAPER)
     start, memory = np.zeros(found.start_size) if start is None else start, found.workspace(len(u))
-    told = (known, limit, penalty, start, u, memory)
-    return (*found.criterion_and_gradient(*told), memory.gradient) if climbs else found.criterion(*told)
+    arguments = (known, limit, penalty, start, u, memory)
+    return (*found.criterion_and_gradient(*arguments), memory.gradient) if climbs else found.criterion(*arguments)
 
 
 def improved(inputs, energy=np.inf):
@@ -42,7 +42,7 @@ def improved(inputs, energy=np.inf):
 
 
 def case_of(name):
-    """Model, interpolation, and what is known: with a prior that matters."""
+    """Model, interpolation, and the nominal system with an informative prior."""
     model, interpolation, c, size = CASES[name]
     c = np.array(c, dtype=np.float64)
     precision = np.diag(1 / (0.1 * np.maximum(np.abs(c), 0.01)) ** 2)
@@ -52,14 +52,14 @@ def case_of(name):
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("motion", "tanks"))) for name in CASES]
 )
-def test_the_worth_is_half_the_log_determinant_of_the_precision(name):
+def test_the_criterion_is_half_the_log_determinant_of_the_precision(name):
     model, interpolation, size, known = case_of(name)
     u = size * np.random.default_rng(0).choice([-0.5, 0.5], 60)
     value, _ = evaluated(
         u, limit=np.inf, known=known, found=compile_d_optimality(model, int(interpolation == "linear"))
     )
-    told = fisher_information(model, known.coefficients, u, 2e-3, 1e-3, interpolation=interpolation)
-    assert value == pytest.approx(0.5 * np.linalg.slogdet(known.precision + told)[1], rel=1e-12)
+    information = fisher_information(model, known.coefficients, u, 2e-3, 1e-3, interpolation=interpolation)
+    assert value == pytest.approx(0.5 * np.linalg.slogdet(known.precision + information)[1], rel=1e-12)
 
 
 @table("size", [1, 4, 7])
@@ -89,15 +89,20 @@ def test_the_gradient_is_that_of_differences(name, moving):
         start[n + 3 : found.n_path] = rng.normal(0, 0.2, found.n_path - n - 3)
         start[found.n_path :] = 0.3 * size
     peak = evaluated(u, start, limit=np.inf, known=known, found=found)[1]
-    told = {"penalty": 100.0, "limit": 0.9 * peak, "known": known, "found": found}  # so that the penalty has its part
-    value, _, gradient = evaluated(u, start, climbs=True, **told)
-    assert value == evaluated(u, start, **told)[0]
-    assert value < evaluated(u, start, **{**told, "penalty": 0.0})[0]
+    settings = {
+        "penalty": 100.0,
+        "limit": 0.9 * peak,
+        "known": known,
+        "found": found,
+    }  # so that the penalty has its part
+    value, _, gradient = evaluated(u, start, climbs=True, **settings)
+    assert value == evaluated(u, start, **settings)[0]
+    assert value < evaluated(u, start, **{**settings, "penalty": 0.0})[0]
     h = 2e-5 * size
     slopes = np.empty(40)
     for t in range(40):
         step = h * (np.arange(40) == t)
-        ahead, behind = ([evaluated(u + s * m * step, start, **told)[0] for s in (1, -1)] for m in (1, 2))
+        ahead, behind = ([evaluated(u + s * m * step, start, **settings)[0] for s in (1, -1)] for m in (1, 2))
         # Of order 4, so that the third derivative does not count.
         slopes[t] = (8 * (ahead[0] - ahead[1]) - (behind[0] - behind[1])) / (12 * h)
     np.testing.assert_allclose(gradient, slopes, rtol=0, atol=1e-6 * np.abs(gradient).max())

@@ -208,7 +208,7 @@ def test_the_budget_is_spent_and_not_exceeded():
     assert np.all(energy > 0.98)
 
 
-def test_looking_ahead_teaches_more_than_myopia_and_a_goal_keeps_still():
+def test_a_longer_horizon_gains_more_than_one_step_and_a_goal_keeps_still():
     *_, near = roll_out("Short", 4, options={"max_output": 0.3}, horizon=1)
     far, *_, gains = roll_out("Short", 4, options={"max_output": 0.3})
     assert gains.mean() > near.mean() + 0.5
@@ -310,7 +310,7 @@ def test_it_plays_a_plant_of_ones_own():
     assert gains["efe"] > gains["prbs"] + 0.5
 
 
-def test_the_map_measures_every_state_by_its_size_at_the_limit():
+def test_the_grid_scales_every_state_by_its_amplitude_at_the_limit():
     paper = SimulatedExperiment().prior_belief.coefficients_mean
     np.testing.assert_array_equal(probe_time_scales(ModelView(difference()), paper, 0.15, 0.6).scales, [0.6, 0.6])
     # A linear oscillator of 2π / 40 rad per sample: its velocity has that much of the displacement's amplitude.
@@ -352,7 +352,7 @@ def test_plans_count_on_what_an_input_moves_within_its_sample():
     assert [recoverable_step(one, ModelView(duffing()), held) for one in (slow, weak, rig)] == [0.0, 0.0, 0.0]
 
 
-def test_other_sensors_see_the_same_swing():
+def test_other_sensors_give_the_same_time_scales():
     omega = 2 * np.pi / 40
     means = [omega**2, 0.0, 0.02, 0.002]
     swings = [
@@ -382,7 +382,7 @@ def test_under_a_budget_plans_follow_the_differential_equation_too():
 
 @table("track", ["Short-v0", "Short-v1"])
 def test_the_margin_is_the_quantile_of_the_risk_in_an_episode(track):
-    """As the module says: exceeded with probability ``risk`` by outputs that all are at the margin."""
+    """Outputs that all lie at the margin exceed the limit with probability ``risk`` in an episode."""
     env, freedom = gym.make(f"duffing_env/{track}"), 4 + (2 + np.arange(48) / 16) ** 2
     for risk in (0.05, 0.5):
         margin = make_policy("efe", env, risk=risk).objective.margin
@@ -450,9 +450,9 @@ def random_belief(rng):
 
 
 @table("left", [4, 200])
-def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
+def test_no_plan_of_full_inputs_scores_higher_than_the_plan_found(left):
     horizon = 4
-    # What is known after one move, two and four counts; a plan to the end is worth what is known there.
+    # The information after one, two and four moves counts; a plan to the end scores the information there.
     weights = np.array([1.0, 1.0, 0.0, 1.0]) if left > horizon else np.array([0.0, 0.0, 0.0, 1.0])
     terms = PlanObjective(0.15, np.inf, 10.0, np.full(left, 2.0), walk=np.zeros(4), scales=np.ones(2))
     for seed in range(4):
@@ -475,8 +475,8 @@ def test_no_plan_of_whole_pushes_is_worth_more_than_the_one_that_is_found(left):
 
 
 @pytest.mark.parametrize(("track", "moves"), [("Amplitude-v0", 44), ("Short-v0", 24)])
-def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves):
-    """Against Eq. (2) in matrices: what 25 moves bring, or all where there are fewer."""
+def test_the_information_rate_after_a_plan_is_the_rate_of_its_last_moves(track, moves):
+    """Against Eq. (2) in matrices: the information of the last 25 moves, or of all where there are fewer."""
     envs = make(track, 3)
     policy = make_policy("efe", envs, seed=0)
     observations, _ = envs.reset(seed=4)
@@ -487,8 +487,8 @@ def test_what_is_expected_after_a_plan_is_what_its_last_moves_bring(track, moves
         np.testing.assert_allclose(state.information_rates[i], (known[-1] - known[-1 - counted]) / counted, rtol=1e-6)
 
 
-def test_what_moves_teach_counts_the_less_the_later():
-    """No plan of eight pushes is better than what is found, as judged in matrices of Eq. (2)."""
+def test_information_of_later_moves_is_discounted():
+    """No plan of eight full inputs scores higher than the plan found, by Eq. (2) in matrices."""
     envs = make("Output", 8, max_output=2.0)
     envs.reset(seed=5)
     for action in np.random.default_rng(6).choice([-1.0, 1.0], (24, 8, 1)).astype(np.float32):
@@ -532,15 +532,15 @@ def test_blocks_begin_with_the_episode_in_a_batch():
         assert (np.count_nonzero(episode[:16], axis=0) > 12).all()
 
 
-def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
-    """It tells more then, and is as safe."""
+def test_a_safe_block_is_scaled_towards_the_limit(monkeypatch):
+    """The scaled block has more information, and is as safe."""
     env = gym.make("duffing_env/Short-v0", max_output=0.3).unwrapped
     observation, _ = env.reset(seed=0)
-    told = {}
+    by_bisections = {}
 
     def best_block(view, systems, futures, candidates, amplitude, bound, played):
         found = chance_constrained_block.optimise_block(view, systems, futures, candidates, amplitude, bound, played)
-        told[chance_constrained_block._N_BISECTIONS] = chance_constrained_block.expected_information(
+        by_bisections[chance_constrained_block._N_BISECTIONS] = chance_constrained_block.expected_information(
             view, systems, futures.limit, found[0]
         )[0]
         assert found[1] == 1.0
@@ -551,5 +551,5 @@ def test_a_safe_block_is_tried_nearer_to_the_limit(monkeypatch):
     for halvings in (0, chance_constrained_block._N_BISECTIONS):
         monkeypatch.setattr(chance_constrained_block, "_N_BISECTIONS", halvings)
         BlockPlanner(env, block=24, risk=0.1).predict(observation)
-    never, often = told.values()
+    never, often = by_bisections.values()
     assert often > never + 0.02

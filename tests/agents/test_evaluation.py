@@ -1,4 +1,4 @@
-"""Evaluation: every metric against a slow computation with single environments and equations by hand."""
+"""Evaluation: every metric against a slow computation with single environments and hand-written equations."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,7 +81,7 @@ def log_density(belief, point):
 
 
 def fisher_gain(coefficients, inputs, outputs, prior):
-    """½ log det of the covariance of (θ, η), before and after, linearised where a filter with the true ones is."""
+    """Decrease of ½ log det of the covariance of (θ, η), linearised along a filter with the true parameters."""
     theta1, theta2, theta3, eta = coefficients
     state, known, cov = np.zeros(2), np.zeros((2, 2)), np.zeros((6, 6))
     cov[2:, 2:] = prior.coefficients_cov
@@ -250,7 +250,7 @@ def test_what_a_jump_of_the_truth_takes_away_is_counted(monkeypatch):
     assert evaluation.estimator_metrics == {}
 
 
-def test_a_sample_of_the_regime_is_worth_one_and_one_of_a_better_policy_more(record):
+def test_sample_efficiency_is_one_for_the_regime_and_more_for_a_better_policy(record):
     prbs, regime = evaluate_policies(["prbs", "silverbox-multisine"], systems=24)
     found = {
         (evaluation.policy, name): np.median(evaluation.metrics[name] / (~np.isnan(evaluation.inputs)).sum(axis=0))
@@ -295,10 +295,12 @@ def test_the_same_seed_gives_the_same_and_another_does_not(without_record):
         assert not set(first.metrics[name]) & set(other.metrics[name])
 
 
-def test_policies_are_told_of_in_turn_and_options_left_alone(without_record):
-    told, options = [], {"horizon": 5}
-    evaluations = evaluate_policies(["prbs", "uniform", "gaussian"], systems=2, options=options, on_policy=told.append)
-    assert told == [evaluation.policy for evaluation in evaluations] == ["prbs", "uniform", "gaussian"]
+def test_policies_are_reported_in_turn_and_options_stay_unchanged(without_record):
+    reported, options = [], {"horizon": 5}
+    evaluations = evaluate_policies(
+        ["prbs", "uniform", "gaussian"], systems=2, options=options, on_policy=reported.append
+    )
+    assert reported == [evaluation.policy for evaluation in evaluations] == ["prbs", "uniform", "gaussian"]
     assert options == {"horizon": 5}
     (alone,) = evaluate_policies(["gaussian"], systems=2, options=options)
     np.testing.assert_array_equal(evaluations[2].gain_curve, alone.gain_curve)
@@ -437,7 +439,7 @@ def test_the_continuous_track_is_evaluated_in_its_own_coefficients(without_recor
     assert "arrow_rmse" not in evaluation.metrics
 
 
-def test_with_noises_that_are_drawn_all_is_measured_with_the_true_ones(without_record):
+def test_metrics_use_the_true_noises_where_noises_are_drawn(without_record):
     (evaluation,) = evaluate_policies(["uniform"], CONTINUOUS, systems=60, seed=SEED)
     assert list(evaluation.estimator_metrics) == ["ode_alone", "nlarx_structured", "nlarx_mean_field", "auditor"]
     assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
@@ -466,7 +468,7 @@ def test_on_the_continuous_track_others_identify_too(without_record):
         assert max(errors["ode"], errors["auditor"]) < 0.02 < 0.1 < errors["nlarx_structured"]  # misspecified
         assert 0.8 < evaluation.estimator_metrics["auditor"]["coverage"].mean() < 0.98
         assert 0.6 < evaluation.estimator_metrics["auditor"]["nees"].mean() < 1.4
-        # What an efficient estimator gains is what the well-specified one does, and no one talks it into more.
+        # The efficient estimator gains as much as the well-specified one, and no estimator raises that gain.
         assert evaluation.metrics["fisher_gain"].mean() == pytest.approx(
             by_ode.metrics["information_gain"].mean(), abs=0.3
         )
@@ -506,12 +508,12 @@ def test_policies_of_several_seeds_are_one_entry(tmp_path, without_record):
         model = PPO("MlpPolicy", DuffingVecEnv(TRACK, 2), n_steps=8, batch_size=16, seed=seed, device="cpu")
         save_policy(tmp_path / name, model, {})
     (tmp_path / "run-3").mkdir()  # a training that is not finished
-    told, options = [], {"horizon": 20}
+    reported, options = [], {"horizon": 20}
     arguments = {"systems": 3, "seed": SEED, "options": options}
-    group, alone = evaluate_policies([f"ppo={tmp_path}/run-*", "uniform"], on_policy=told.append, **arguments)
+    group, alone = evaluate_policies([f"ppo={tmp_path}/run-*", "uniform"], on_policy=reported.append, **arguments)
     each = evaluate_policies(sorted(str(tmp_path / name) for name in names), **arguments)
     assert (group.policy, group.seeds, group.title, alone.title) == ("ppo", 3, "ppo (3 seeds)", "uniform")
-    assert told == [*(evaluation.policy for evaluation in each), "uniform"]
+    assert reported == [*(evaluation.policy for evaluation in each), "uniform"]
     for name, values in group.metrics.items():
         if name != "decision_time":
             np.testing.assert_array_equal(values.reshape(3, 3), [evaluation.metrics[name] for evaluation in each])
@@ -589,7 +591,7 @@ def test_what_is_shown_changes_nothing_of_what_is_measured(shown):
     np.testing.assert_array_equal(other.metrics["fisher_gain"], usual.metrics["fisher_gain"])
 
 
-def test_what_is_compared_where_the_posterior_is_not_seen_are_signals():
+def test_without_the_posterior_as_observation_only_signals_are_compared():
     assert default_policies(TRACK, {"observation": "history"}) == ("prbs", "uniform")
     assert default_policies(TRACK, {"hold": 4}) == ("ppo/amplitude", "prbs", "uniform")
     assert {"efe", "shield", "ppo/amplitude"} < set(default_policies(TRACK, {"observation": "posterior"}))

@@ -1,4 +1,4 @@
-"""The mean worth of inputs over many systems, and its gradient: those of each system, one by one."""
+"""The mean criterion of inputs over many systems, and its gradient, against each system by itself."""
 
 import sys
 from pathlib import Path
@@ -40,7 +40,7 @@ def drawn(name, systems):
 
 
 def one_by_one(model, degree, systems, limit, penalty, u):
-    """The mean worth, its gradient, and the peaks (S,)."""
+    """The mean criterion, its gradient, and the peaks (S,)."""
     found, values, gradients, peaks = compile_d_optimality(model, degree), [], [], []
     memory = found.workspace(len(u))
     for c, start, noises, shakes in zip(*systems[:4], strict=True):
@@ -68,7 +68,7 @@ def test_the_mean_worth_and_its_gradient_are_those_of_each_system(name):
     np.testing.assert_allclose(memory.gradient, slopes, rtol=0, atol=1e-9 * np.abs(slopes).max())
 
 
-def test_a_system_that_runs_away_counts_what_it_told_until_then():
+def test_a_diverging_system_counts_its_information_until_then():
     model, degree, systems, u = drawn("paper", 3)
     systems.coefficients[1] *= 1e3  # its outputs overflow
     expected, slopes, peaks = one_by_one(model, degree, systems, 1.0, 0.0, u)

@@ -37,7 +37,7 @@ def seen_through(rows=6, seed=2, env_id=AMPLITUDE, fitted=False, levels=0, in_na
 
 
 def test_rewards_differ_from_the_environments_by_a_potential():
-    """Over an episode they add up to the plain return less what was to come at its start, whatever is done."""
+    """Over an episode they sum to the plain return minus the potential at its start, for any actions."""
     plain, envs = DuffingVecEnv(AMPLITUDE, 6, seed=2, **NARROW), seen_through(**NARROW)
     found, rng = FeatureEncoder.of(plain.envs), np.random.default_rng(0)
     envs.reset()
@@ -70,7 +70,7 @@ def test_rewards_differ_from_the_environments_by_a_potential():
     [(AMPLITUDE, False, {"reward": "parameter_error"}), (POWER, True, {}), (AMPLITUDE, True, {"drift": 0.01})],
 )
 def test_rewards_without_a_potential_stay_as_they_are(env_id, in_nats, options):
-    """Those that count no information, and where it is limited by energy or forgotten."""
+    """Rewards without information, and tracks with an energy limit or drift."""
     options = {"horizon": 24, **options}
     plain = DuffingVecEnv(env_id, 3, seed=2, **options)
     envs = seen_through(rows=3, env_id=env_id, in_nats=in_nats, **options)
@@ -157,7 +157,7 @@ def test_a_policy_acts_the_same_from_its_file(tmp_path, algo, settings):
 
 
 def agreement(choose, envs):
-    """The share of an episode's decisions that are to the side of those of velocity-sign."""
+    """The share of an episode's decisions with the same sign as velocity-sign's."""
     teacher, agreed = make_policy("velocity-sign", envs), []
     shown, _ = envs.reset(seed=0)
     for _ in range(80):
@@ -169,10 +169,10 @@ def agreement(choose, envs):
 
 @pytest.mark.parametrize("levels", [0, 3])
 def test_a_network_learns_what_another_policy_decides(levels):
-    """In the other's own episodes it agrees seldom before, and mostly after."""
+    """In the teacher's episodes the network agrees rarely before imitation, and mostly after it."""
     asked = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=levels)
     envs = seen_through(rows=32, fitted=True, levels=levels)
-    model, found, told = asked.make(envs, seed=1), FeatureEncoder.of(envs.venv.envs), []
+    model, found, progress = asked.make(envs, seed=1), FeatureEncoder.of(envs.venv.envs), []
 
     def choose(shown):
         features = found(shown)
@@ -180,14 +180,14 @@ def test_a_network_learns_what_another_policy_decides(levels):
         return features.to_actions(np.linspace(-1, 1, levels)[choices] if levels else choices[:, 0])
 
     before = agreement(choose, make_track_batch(AMPLITUDE, 32))
-    imitate_policy(model, envs, "velocity-sign", 8192, 0, told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    imitate_policy(model, envs, "velocity-sign", 8192, 0, progress.append)
+    assert progress == sorted(progress)
+    assert progress[-1] == 1.0
     assert before < 0.5 < 0.8 < agreement(choose, make_track_batch(AMPLITUDE, 32))
 
 
 def test_a_run_begins_with_what_was_imitated(tmp_path):
-    """So a run that learns next to nothing by reward decides as its teacher; the same again by the same seed."""
+    """A run that learns almost nothing from rewards decides like its teacher, and the same seed repeats it."""
     settings = PPOSettings(num_envs=32, n_steps=16, batch_size=64, hidden=(64,), levels=3, learning_rate=1e-9)
     envs, agreed, weights = make_track_batch(AMPLITUDE, 32), [], []
     for name, teacher in (("plain", None), ("one", "velocity-sign"), ("again", "velocity-sign")):
@@ -216,7 +216,7 @@ def test_what_cannot_imitate_is_refused(settings, message):
         TrainConfig(imitate="efe", **settings)
 
 
-def test_entropy_counts_less_and_less(tmp_path, monkeypatch):
+def test_the_entropy_weight_decreases(tmp_path, monkeypatch):
     seen = []
     original = TrainingCallback._on_rollout_end
 

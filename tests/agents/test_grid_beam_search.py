@@ -1,4 +1,4 @@
-"""The best way through the map of the state, and how many are followed."""
+"""The best path through the grid of states, and the width of the beam."""
 
 import numba
 import numpy as np
@@ -25,7 +25,7 @@ from estimator.engine.expected_update import DIVERGED_SCORE
 
 @settings(deadline=None)
 @given(arrays(float, st.integers(1, 200), elements=st.floats(-1.0, 1.0)), st.integers(1, 64))
-def test_no_more_ways_are_followed_than_there_is_place_for(scores, most):
+def test_the_beam_keeps_no_more_paths_than_its_width(scores, most):
     enough = score_threshold(scores, most)
     assert scores.max() - _PRUNE_GAP <= enough <= scores.max()
     followed = np.sum(scores >= enough)
@@ -35,11 +35,11 @@ def test_no_more_ways_are_followed_than_there_is_place_for(scores, most):
     assert lower > most or np.sum(scores >= scores.max() - _PRUNE_GAP) <= most
 
 
-def test_ways_that_are_lost_are_followed_when_there_are_no_others():
+def test_lost_paths_are_kept_when_there_are_no_others():
     assert score_threshold(np.full(5, DIVERGED_SCORE), 3) == DIVERGED_SCORE
 
 
-def test_the_best_of_many_are_followed():
+def test_the_beam_keeps_the_best_paths():
     scores = np.random.default_rng(0).permutation(np.arange(400) * 1e-3)
     np.testing.assert_array_equal(
         np.sort(scores[scores >= score_threshold(scores, 96)])[-90:], np.arange(310, 400) * 1e-3
@@ -47,7 +47,7 @@ def test_the_best_of_many_are_followed():
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_best_way_is_that_of_plain_numpy(seed):
+def test_the_best_path_equals_plain_numpy(seed):
     envs = make_track_batch("duffing_env/Output-v0", 1, {})
     actions = np.random.default_rng(seed).choice([-0.4, 0.4], (24, 1, 1)).astype(np.float32)
     envs.reset(seed=seed)
@@ -66,13 +66,13 @@ def test_the_best_way_is_that_of_plain_numpy(seed):
 
 
 def best_way(view):
-    """The search through the map, for callers in Python."""
+    """The beam search, for callers in Python."""
     memory, find = compile_grid_beam_search(*view)
     return numba.njit(lambda task, found, words: find(memory(task.n_moves, task.beam_width), task, found, words))
 
 
 def reference(belief, task, words):
-    """The best way through the map of the state of Eq. (2), from matrices and way by way."""
+    """The best path through the grid of states of Eq. (2), with matrices and path by path."""
     terms, L = task.objective, task.objective.limit
     theta, offsets = belief.coefficients_mean, (next_uniform(words), next_uniform(words))
     q, r = belief.noises[1] / belief.noises[0], belief.noises[3] / belief.noises[2]
@@ -87,7 +87,7 @@ def reference(belief, task, words):
         shaken = max((S @ gain)[0] ** 2 * variance, terms.accumulated_noise * q)
         variance = P[0, 0] + r
         gain, deviation = P[:, 0] / variance, np.sqrt(variance + shaken)
-        # What braking harder than planned makes up for.
+        # The compensation by braking harder than planned.
         spared = terms.recoverable_step * (terms.amplitude + u if moved[0] > 0 else terms.amplitude - u)
         margin = max(terms.margin * np.sqrt(variance), terms.margin * deviation - spared)
         near = max(0.0, abs(moved[0]) + min(margin, 0.5 * L) - L) / deviation
@@ -114,12 +114,12 @@ def reference(belief, task, words):
             for part in tried:
                 for z, C, gain, variance, cost, inputs in followed[block : block + LANES]:
                     u = part * terms.amplitude
-                    to, D, told, spread, price = sample(z, C, u, gain, variance)
+                    to, D, gained, spread, price = sample(z, C, u, gain, variance)
                     to_come = max(0, task.samples_left - h - 1) * task.information_factor @ task.information_factor.T
                     known = 0.5 * np.linalg.slogdet(np.linalg.inv(D[2:, 2:]) + to_come)[1]
                     score = known - cost - price
                     if score > entered.get(cell(to), (-np.inf,))[0]:
-                        entered[cell(to)] = score, (to, D, told, spread, cost + price, [*inputs, u])
+                        entered[cell(to)] = score, (to, D, gained, spread, cost + price, [*inputs, u])
         most = task.beam_width if h < task.n_moves_some_inputs else task.far_beam_width
         enough = score_threshold(np.array([score for score, _ in entered.values()]), most)
         kept = [found for found in entered.values() if found[0] >= enough][:most]

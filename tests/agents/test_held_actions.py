@@ -24,11 +24,11 @@ def stand_in(hold, **limits):
 
 def play(policy, rows, steps):
     """Actions (steps, rows)."""
-    state, told = None, []
+    state, played = None, []
     for _ in range(steps):
         actions, state = policy.predict(np.zeros((rows, 22)), state)
-        told.append(actions[:, 0])
-    return np.array(told)
+        played.append(actions[:, 0])
+    return np.array(played)
 
 
 @table("name", ["uniform", "chirp-linear", "prbs-2", "schroeder"])

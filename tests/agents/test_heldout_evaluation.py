@@ -27,33 +27,39 @@ def rows(folder):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """An evaluated run, and what its evaluations told on the way."""
-    told = []
+    """An evaluated run, and the scores that its evaluations reported."""
+    reported = []
     folder = tmp_path_factory.mktemp("runs") / "run"
-    return train(tiny(folder, eval_every=200, checkpoints=4), lambda steps, found: told.append((steps, found))), told
+    return train(
+        tiny(folder, eval_every=200, checkpoints=4), lambda steps, found: reported.append((steps, found))
+    ), reported
 
 
-def test_evaluations_are_told_and_written(run):
-    made, told = run
-    assert [steps for steps, _ in told] == [0, 256, 512]  # before all updates, and the first after 200 and 400 samples
-    assert rows(made.folder) == [{"steps": steps, **found._asdict()} for steps, found in told]
-    assert isinstance(told[0][1], HeldOutScores)
-    assert told[0] != told[1]
+def test_evaluations_are_reported_and_written(run):
+    made, reported = run
+    assert [steps for steps, _ in reported] == [
+        0,
+        256,
+        512,
+    ]  # before all updates, and the first after 200 and 400 samples
+    assert rows(made.folder) == [{"steps": steps, **found._asdict()} for steps, found in reported]
+    assert isinstance(reported[0][1], HeldOutScores)
+    assert reported[0] != reported[1]
 
 
 def test_they_are_the_metrics_of_evaluate(run):
-    made, told = run
+    made, reported = run
     best = json.loads((made.folder / "best" / "policy.json").read_text())
     told_of = best["evaluation"]
     options = {"branch": "validation"}
     (evaluation,) = evaluate_policies([str(made.folder)], ENV, told_of["systems"], told_of["seed"], options)
     for name in HeldOutScores._fields:
-        assert evaluation.metrics[name].mean() == pytest.approx(getattr(told[-1][1], name), rel=1e-12), name
+        assert evaluation.metrics[name].mean() == pytest.approx(getattr(reported[-1][1], name), rel=1e-12), name
 
 
 def test_the_best_policy_is_kept(run):
-    made, told = run
-    steps, found = max(told, key=lambda entry: entry[1].log_posterior_gain)
+    made, reported = run
+    steps, found = max(reported, key=lambda entry: entry[1].log_posterior_gain)
     card = make_policy(str(made.folder / "best")).card
     assert card["steps"] == steps
     assert {name: card["evaluation"][name] for name in HeldOutScores._fields} == found._asdict()
@@ -67,7 +73,7 @@ def test_evaluating_does_not_move_the_training(run, tmp_path):
     assert first == second
 
 
-def test_training_refuses_systems_that_are_to_compare_on(tmp_path):
+def test_training_refuses_systems_of_the_comparison(tmp_path):
     with pytest.raises(ValueError, match="options must not hold branch"):
         tiny(tmp_path, options={"branch": "test"})
 

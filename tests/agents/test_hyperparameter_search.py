@@ -81,7 +81,7 @@ def test_a_search_finds_what_was_best_and_goes_on(tmp_path, optuna, capsys):
 
 @pytest.mark.parametrize("at_once", [False, True], ids=["trained", "began"])
 def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch, at_once):
-    """Also where it was killed between two of its hyperparameters."""
+    """The same holds for a trial that was killed between two of its hyperparameters."""
 
     def stand_in(run, report):
         report(run.steps, HeldOutScores(0.0, 1.0, 0.9, 0.0))
@@ -92,8 +92,8 @@ def test_a_trial_that_was_killed_is_made_again(tmp_path, optuna, monkeypatch, at
     tune_hyperparameters(tiny(folder), 1)
     journal = folder / "study.log"
     lines = journal.read_text().splitlines()
-    told = [k for k, line in enumerate(lines) if json.loads(line)["op_code"] == 5]  # a hyperparameter of a trial
-    kept = lines[: told[0] + 1] if at_once else lines[:-1]  # without its last line, the trial is still running
+    reported = [k for k, line in enumerate(lines) if json.loads(line)["op_code"] == 5]  # a hyperparameter of a trial
+    kept = lines[: reported[0] + 1] if at_once else lines[:-1]  # without its last line, the trial is still running
     journal.write_text("\n".join(kept) + "\n")
     tune_hyperparameters(tiny(folder), 1)
     tune_hyperparameters(tiny(folder), 2)
@@ -131,7 +131,7 @@ def test_optuna_is_asked_for_before_anything_is_written(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "work"), [(["--tune", "3"], "tune_hyperparameters"), (["--seeds", "2"], "train_seeds")]
 )
-def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, work, monkeypatch, capsys):
+def test_several_stopped_trainings_continue_with_the_same_command(words, work, monkeypatch, capsys):
     def stopped(*arguments, **options):
         raise Interrupted(signal.SIGTERM, "go on with: duffing-env train --resume one of them")
 
@@ -139,8 +139,8 @@ def test_several_trainings_that_are_stopped_go_on_by_the_same_command(words, wor
     with pytest.raises(SystemExit) as caught:
         main("duffing-env train", ["--env", "Short-v0", *words])
     assert caught.value.code == 128 + signal.SIGTERM
-    told = capsys.readouterr().err
-    assert told == "duffing-env train: stopped; the same command goes on with what is left\n"
+    messages = capsys.readouterr().err
+    assert messages == "duffing-env train: stopped; the same command goes on with what is left\n"
 
 
 def test_a_search_says_how_its_best_is_trained_with(tmp_path, monkeypatch, capsys):

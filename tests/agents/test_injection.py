@@ -37,7 +37,7 @@ RIG = {
     "step": 1e-3, "input": {"unit": "N", "limit": 6.0}, "output": {"unit": "m", "range": 0.03, "noise": 5e-6},
     "guess": {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)},
 }  # fmt: skip
-#: For what takes long: all of it at once, and what there is no room for.
+#: For slow tests: all special characters at once, and a name that is too long for its place.
 SHARP = ["<img src=x onerror=1>\x1b[2J\n[/]$\\frac{$\u202e'", "=cmd|' '!A0", "_hidden", "n" * 300, "$" * 300]
 names = tables.table("name", NAMES)
 
@@ -90,10 +90,10 @@ def test_a_policy_in_tables(name, evaluation, capsys):
     named, other = replace(evaluation, policy=name), replace(evaluation, policy="other")
     print_comparison_table([named, other], "title")
     print_texts_and_tables(format_table(["name"], [[name]]), name)
-    told = capsys.readouterr().out
-    assert is_tame(told)
+    printed = capsys.readouterr().out
+    assert is_tame(printed)
     if len(name) < 20:
-        assert told.count(named.title) >= (1 if "\n" in name else 2)  # cells keep their lines
+        assert printed.count(named.title) >= (1 if "\n" in name else 2)  # cells keep their lines
 
 
 @names
@@ -111,9 +111,9 @@ def test_an_error_is_one_line(name, capsys):
     with pytest.raises(SystemExit) as ended, one_line_errors("duffing-env"):
         raise ValueError(f"rig must be a file, but is {name}")
     assert ended.value.code == 2
-    told = capsys.readouterr().err
-    assert len(told.splitlines()) == 1
-    assert is_tame(told)
+    messages = capsys.readouterr().err
+    assert len(messages.splitlines()) == 1
+    assert is_tame(messages)
     # Words that no option takes are repeated as they were typed: by tyro, not here.
     for words in (["identify", name, "none.csv"], ["evaluate", "--policies", name], ["export", name, "--output", "x"],
                   ["report", "--board", name]):  # fmt: skip
@@ -124,7 +124,7 @@ def test_an_error_is_one_line(name, capsys):
 
 
 @names
-def test_what_is_being_done(name, capsys, monkeypatch):
+def test_a_name_in_a_progress_line(name, capsys, monkeypatch):
     monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
     with show_progress("Evaluating") as tell:
         tell(0.5, name)
@@ -136,7 +136,7 @@ def test_what_is_being_done(name, capsys, monkeypatch):
 
 
 @sharp
-def test_a_channel(name, tmp_path):
+def test_a_channel_name(name, tmp_path):
     """A unit stands in the heads of CSV files, in comments of rig files, in pages and figures."""
     described = RIG | {"input": {"unit": name[:40].replace("\n", "").replace("[", "("), "limit": 6.0}}
     if not is_tame(name):
@@ -174,7 +174,7 @@ def record(path):
 
 
 @sharp
-def test_a_file(name, tmp_path, capsys):
+def test_a_file_name(name, tmp_path, capsys):
     """Of a record: in the rig file made from it, in the page, and in what is printed."""
     if "/" in name or len(name) > 200:
         name = name.replace("/", ":")[:200]

@@ -29,8 +29,8 @@ def test_episodes_are_whole(grade):
     assert len({episode["observations"][1].tobytes() for episode in episodes}) == 300  # no episode twice
 
 
-def test_actions_give_what_is_told_again():
-    """What is written is one history: the same seed and actions give the same observations and rewards."""
+def test_recorded_actions_reproduce_observations_and_rewards():
+    """A dataset holds consistent episodes: the same seed and actions give the same observations and rewards."""
     (episode, *_) = collect_episodes(Config("medium", SHORT, episodes=4))
     envs = make_track_batch(SHORT, 4)
     envs.reset(seed=int(np.random.SeedSequence(0).generate_state(1)[0]))

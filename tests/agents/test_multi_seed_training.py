@@ -103,7 +103,7 @@ def test_a_search_on_ray_has_all_its_trials(tmp_path):
 
 @needs_ray
 @pytest.mark.filterwarnings("ignore")
-def test_what_a_task_raises_is_told_as_it_is(tmp_path):
+def test_the_error_of_a_task_is_raised_unchanged(tmp_path):
     checkpoint = tmp_path / "0" / "checkpoints" / "000000256"
     checkpoint.mkdir(parents=True)
     (checkpoint / "training.json").write_text("{")

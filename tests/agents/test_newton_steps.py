@@ -9,7 +9,7 @@ AMPLITUDE, STEPS, CHANGED = 0.15, 16, 20
 
 
 def made(rng, horizon, teaching, near_at, sensitivities, weights):
-    """Rivals whose nudged plans are worth what a linear teaching and the margin's cost say, and the plan."""
+    """A batch whose perturbed plans are scored by a linear information and the margin's cost, and the plan."""
     plan = rng.choice([-1.0, 1.0, 0.3], horizon) * AMPLITUDE
     plan[0] = 0.3 * AMPLITUDE  # one at least is free
     rivals = empty_candidate_batch(horizon)
@@ -60,11 +60,11 @@ def case(seed, horizon, near_at):
 @table("seed", range(3))
 def test_steps_are_those_of_newton(seed, horizon):
     near = np.random.default_rng(seed + 10).uniform(-3.0, 2.0, min(horizon, 12))
-    rivals, plan, told = case(seed, horizon, near)
+    rivals, plan, derivatives = case(seed, horizon, near)
     assert fill_newton_candidates(rivals, horizon, AMPLITUDE) == STEPS
     n = min(horizon, CHANGED)
     # Differences are of a thousandth of the amplitude, over which the cost's slope changes a bit.
-    got, want = rivals.candidates[:STEPS, :n] - plan[:n], reference(plan, *told)
+    got, want = rivals.candidates[:STEPS, :n] - plan[:n], reference(plan, *derivatives)
     np.testing.assert_allclose(got, want, atol=0.02 * AMPLITUDE)
     np.testing.assert_array_equal(rivals.candidates[:STEPS, n:], np.tile(plan[n:], (STEPS, 1)))
     assert np.abs(rivals.candidates[:STEPS]).max() <= AMPLITUDE

@@ -20,7 +20,7 @@ PRBS = ("--protocol", "Short-v0", "--policies", "prbs")
 
 @pytest.fixture(scope="module")
 def entry():
-    """What uniform noise is worth, on few systems."""
+    """The entry of uniform noise, on few systems."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "N_SYSTEMS", 8)
         return protocol.measure_policy("uniform", SHORT, "noise")
@@ -45,17 +45,17 @@ def command(tmp_path, monkeypatch, capsys):
 def test_a_policy_of_one_s_own_reaches_the_board_with_one_command(command, tmp_path):
     (tmp_path / "lab.py").write_text("def push(seen):\n    return seen[:, 0] * 0 + 1\n")
     words = ("evaluate", "--protocol", "Short-v0", "--policies", "lab:push", "--submit", "push", "--samples", "90000")
-    status, told, messages = command(*words)
+    status, printed, messages = command(*words)
     assert status == 0, messages
-    assert "push is on the board runs/leaderboard.jsonl" in told
+    assert "push is on the board runs/leaderboard.jsonl" in printed
     (entry,) = leaderboard_file.read_entries(tmp_path / "runs/leaderboard.jsonl")
     assert (entry["name"], entry["track"], entry["budget"], entry["seeds"]) == ("push", SHORT, "0.1M", 1)
     assert entry["policies"]["lab:push"].startswith("sha256:")
     assert 0 < entry["score"]["low"] <= entry["score"]["iqm"] <= entry["score"]["high"] < 1
     assert entry["shifted"].keys() == {"parameters", "noises", "limits", "equation"}
-    status, told, _ = command("report", "--output", "board.html")
+    status, printed, _ = command("report", "--output", "board.html")
     assert status == 0
-    assert any(line.split()[:1] == ["push"] for line in told.splitlines())
+    assert any(line.split()[:1] == ["push"] for line in printed.splitlines())
     assert "<td>push</td>" in (tmp_path / "board.html").read_text()
 
 
@@ -165,7 +165,7 @@ def test_the_latest_entry_of_a_name_counts(monkeypatch, tmp_path, entry):
 
 
 @table("line", ["{", "[]", '{"name": "x"}', '{"name": "x", "track": "y", "score": 3}'])
-def test_a_broken_board_is_told(tmp_path, entry, line):
+def test_a_damaged_board_is_reported(tmp_path, entry, line):
     path = tmp_path / "board.jsonl"
     path.write_text(json.dumps(entry) + "\n" + line + "\n")
     with pytest.raises(ValueError, match=r"board must hold an entry a line, but .*board.jsonl:2 is not one"):
@@ -193,13 +193,13 @@ def test_names_of_the_board_that_ships_are_taken(command, tmp_path):
     assert leaderboard_file.check_new_entry(leaderboard_file.SHIPPED_LEADERBOARD, "efe") == {SHORT}
 
 
-def test_a_name_that_is_submitted_twice_is_told(tmp_path, command, entry, monkeypatch):
+def test_a_name_that_is_submitted_twice_is_reported(tmp_path, command, entry, monkeypatch):
     monkeypatch.setattr(protocol, "measure_policy", lambda *arguments: entry)
     words = ("evaluate", "--protocol", "Short-v0", "--policies", "uniform", "--submit", "noise", "--board", "b.jsonl")
     first, second = command(*words)[1], command(*words)[1]
-    told = f"The board had noise on {SHORT} before; the report shows the latest entry of a name."
-    assert told not in " ".join(first.split())
-    assert told in " ".join(second.split())
+    message = f"The board had noise on {SHORT} before; the report shows the latest entry of a name."
+    assert message not in " ".join(first.split())
+    assert message in " ".join(second.split())
 
 
 def test_a_board_is_looked_at_before_the_measurement(command, monkeypatch, tmp_path, entry):
@@ -242,7 +242,7 @@ def test_the_board_that_ships_is_of_what_ships():
     shown = {entry["name"] for entry in entries if entry["track"] == SHORT}
     assert {"ppo/short", "shield", "efe", "prbs", "uniform", "multisine", "velocity-sign"} <= shown
     for entry in entries:
-        # What has a name without a training has learned nothing.
+        # Names without a training have not learned.
         assert (entry["budget"] == "none") == (entry["name"] in POLICIES), entry["name"]
         for policy, found in entry["policies"].items():
             if policy in protocol.trained_policies():

@@ -1,4 +1,4 @@
-"""What a foolish agent must not get away with: rewards rank inputs as an independent auditor's errors do."""
+"""Rewards cannot be exploited: they rank inputs as the errors of an independent estimator do."""
 
 import gymnasium as gym
 import numpy as np

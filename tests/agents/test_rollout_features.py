@@ -1,4 +1,4 @@
-"""What a network sees: against a plain reference, for every model, turned over; and the shield."""
+"""Features of networks: against a plain reference, for every model, mirrored; and the shield."""
 
 import json
 from functools import cache
@@ -34,7 +34,7 @@ def environment(name):
 
 
 def observed(env_id, samples=120, rows=12):
-    """What some episodes show, of which most inputs push along the velocity."""
+    """Observations of some episodes, in which most inputs have the sign of the velocity."""
     envs, rng = make_track_batch(env_id, rows), np.random.default_rng(1)
     shown, _ = envs.reset(seed=0)
     seen = [shown.copy()]
@@ -107,7 +107,7 @@ def test_features_of_any_observation_are_finite_and_bounded(name, seed):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_an_observation_looks_the_same_alone_in_a_batch_and_turned_over(name):
+def test_features_are_the_same_alone_in_a_batch_and_mirrored(name):
     env = environment(name)
     found, seen = FeatureEncoder.of(env), anywhere(env, 1, rows=40)
     together = found(seen)
@@ -143,8 +143,8 @@ def test_the_observation_stands_behind_the_features():
     assert (own.observation_size, own.size) == (len(ENTRIES), len(FEATURE_NAMES) + len(ENTRIES))
 
 
-def test_the_shield_hardly_ever_lets_random_pushes_leave():
-    """Of 64 systems; without it most leave, though a random push is no swing."""
+def test_the_shield_keeps_nearly_all_random_inputs_within_the_limit():
+    """Of 64 systems most leave the range without the shield, under random inputs."""
     ended = {}
     for shielded in (True, False):
         envs, rng = make_track_batch(AMPLITUDE, 64), np.random.default_rng(3)

@@ -177,7 +177,7 @@ def test_reset_starts_over_and_takes_a_seed():
 
 
 @table("name", ["square", "velocity-sign", "efe-myopic", "efe-block-16", lambda seen: seen[:, 0]])
-def test_what_is_no_array_is_refused_by_name(name):
+def test_an_object_that_is_no_array_is_refused_by_name(name):
     env = gym.make("duffing_env/Amplitude-v0")
     observation, _ = env.reset(seed=0)
     policy = make_policy(name, env)
@@ -334,6 +334,6 @@ def test_a_path_loads_the_trained_policy(tmp_path, monkeypatch):
 
 
 @table("name", ["prbs", "efe", "shield"])
-def test_the_name_of_an_environment_is_none(name):
+def test_the_name_of_an_environment_is_no_policy(name):
     with pytest.raises(ValueError, match="env must be an environment, but is 'duffing_env/Short-v1'; pass what gym"):
         make_policy(name, "duffing_env/Short-v1")

@@ -191,13 +191,13 @@ def test_saving_again_replaces_the_policy(tmp_path):
     assert_acts_as(load_policy(folder), model, folder, random_observations())
 
 
-def test_the_card_tells_what_it_was_told(tmp_path):
+def test_the_card_has_the_given_settings(tmp_path):
     folder, _ = saved(tmp_path, card={"algorithm": "ppo", "steps": 7, "config": {"reward": "log_posterior"}})
     card = load_policy(folder).card
     assert json.loads((folder / CARD_FILE).read_text()) == card
     assert card.pop("network")["activation"] == "tanh"
-    told = {"format": 4, "observation": "posterior", "algorithm": "ppo", "steps": 7}
-    assert card == {**told, "config": {"reward": "log_posterior"}}
+    settings = {"format": 4, "observation": "posterior", "algorithm": "ppo", "steps": 7}
+    assert card == {**settings, "config": {"reward": "log_posterior"}}
 
 
 def test_actions_are_in_range_and_the_state_is_passed_on(tmp_path):
@@ -448,13 +448,13 @@ def test_the_search_for_unpicklers_finds_them(source):
 
 
 @pytest.mark.parametrize("name", ["ppo/drift", "ppo/short"])  # of the others: tests/research/test_ship_policy.py
-def test_a_policy_that_ships_does_what_its_card_says(name):
+def test_a_shipped_policy_scores_as_its_card_says(name):
     card = make_policy(name).card
     (evaluation,) = evaluate_policies([name], card["config"]["env"], systems=32)
-    # Of several training seeds the card tells all, and which of them ships.
+    # With several training seeds the card has the scores of all, and names the one that ships.
     place = card["seeds"].index(card["shipped"]["seed"])
     for metric, slack in (("information_gain", 0.05), ("coverage", 0.02)):
         values = evaluation.metrics[metric]
-        told = card["scores"][metric]
-        expected = told["seeds"][place] if "seeds" in told else told["mean"]
+        scores = card["scores"][metric]
+        expected = scores["seeds"][place] if "seeds" in scores else scores["mean"]
         assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(32) + slack

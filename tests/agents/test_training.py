@@ -124,7 +124,7 @@ def test_checkpoints_are_policies_on_the_way(runs):
     np.testing.assert_array_equal(actions[-1], trained)  # each comes after the update of its samples
 
 
-def test_the_curve_and_the_log_tell_the_same(runs):
+def test_the_curve_and_the_log_agree(runs):
     run = runs["first"]
     steps, seconds, returns = np.array(run.curve, dtype=float).T
     np.testing.assert_array_equal(steps, [4096, 8192, 12288, 16384, 20480])
@@ -237,10 +237,10 @@ def test_a_training_in_which_no_episode_ended_says_so(tmp_path, capsys, monkeypa
     monkeypatch.setattr("estimator.support.progress.REPORT_INTERVAL", 0.0)
     settings = {"hyperparameters": TINY, "systems": 0, "reward": "information_gain"}
     TrainCommand(steps=256, output=tmp_path / "run", options={"max_output": 10.0}, **settings).run()
-    told, said = capsys.readouterr()
+    printed, said = capsys.readouterr()
     assert "left: no episode has ended" in " ".join(said.split())
-    assert "No episode ended, so there is no learning curve" in told
-    assert "nan" not in told
+    assert "No episode ended, so there is no learning curve" in printed
+    assert "nan" not in printed
     assert not (tmp_path / "run" / "learning_curve.png").exists()
 
 
@@ -306,7 +306,7 @@ def test_senseless_hyperparameters_are_refused(settings, message):
 
 
 @pytest.mark.slow  # a training that has to be long enough to learn something
-def test_training_beats_signals_that_do_not_look(tmp_path):
+def test_training_beats_open_loop_signals(tmp_path):
     """Clearly: on the same systems, 95 % intervals apart, after 600,000 samples."""
     ppo = PPOSettings(num_envs=256, n_steps=32, batch_size=2048, learning_rate=3e-3, hidden=(32,))
     run = train(TrainConfig(steps=600_000, output=tmp_path / "run", torch_threads=1, hyperparameters=ppo))
@@ -319,7 +319,7 @@ def test_training_beats_signals_that_do_not_look(tmp_path):
 
 
 @pytest.mark.slow
-def test_sac_beats_signals_that_do_not_look(tmp_path):
+def test_sac_beats_open_loop_signals(tmp_path):
     """With the file's hyperparameters, on the same systems, 95 % intervals apart, after 30,000 samples."""
     env = "duffing_env/Short-v0"
     run = train(TrainConfig(algo="sac", env=env, steps=30_000, output=tmp_path / "run"))

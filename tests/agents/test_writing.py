@@ -289,21 +289,21 @@ def test_a_training_whose_disk_is_full_before_its_first_checkpoint_leaves_nothin
 
 
 def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):
-    rig, told = Rig.from_file(bench / "bench.toml"), []
+    rig, calls = Rig.from_file(bench / "bench.toml"), []
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     class Filling(SimulatedPlant):
         """Leaves room for half a row after 30 samples."""
 
         def read(self):
-            told.append("read")
-            if len(told) == 46:  # 16 of them while it listened
+            calls.append("read")
+            if len(calls) == 46:  # 16 of them while it listened
                 size = (tmp_path / "out/samples.csv").stat().st_size
                 resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, hard))
             return super().read()
 
         def disarm(self):
-            told.append(self._u)
+            calls.append(self._u)
             super().disarm()
 
     plant = Filling(rig, clock=JumpingClock())
@@ -312,7 +312,7 @@ def test_a_run_ends_with_its_input_at_zero_and_whole_rows(bench, tmp_path):
             run_experiment(rig, plant, tmp_path / "out", RunSettings("prbs", 64), clock=plant.clock)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert told[-1] == 0.0
+    assert calls[-1] == 0.0
     table = read_table(tmp_path / "out/samples.csv")
     np.testing.assert_array_equal(table.columns[0], np.arange(table.columns.shape[1]))
     assert table.columns.shape[1] >= 45

@@ -12,7 +12,7 @@ from duffing_env.batch import spawn_seeds
 
 
 class Remembered(gym.Wrapper):
-    """A single environment that keeps what its episodes ended with."""
+    """A single environment that keeps the final infos of its episodes."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -36,7 +36,7 @@ def without_endings(infos):
 
 
 def assert_rows_are_singles(environment, mode, rows=5, steps=60, **options):
-    """Everything that the vector gives, beside Gymnasium's own vector of single environments; gives its steps."""
+    """Compare all results with Gymnasium's own vector of single environments; return the steps."""
     envs = environment.make_vec(rows, autoreset_mode=mode, **options)
     makers = [lambda: Remembered(environment.make(**options))] * rows
     singles = SyncVectorEnv(makers, autoreset_mode=mode)
@@ -85,7 +85,7 @@ def test_rows_that_hold_their_actions_are_single_environments(environment):
 
 
 @pytest.mark.parametrize("environment", VECTORS)
-def test_rows_do_not_depend_on_who_lies_beside_them(environment):
+def test_rows_do_not_depend_on_their_neighbours_in_a_block(environment):
     # A block has 32 lanes: the first row alone, rows across two blocks, and one of a third, which is not full.
     whole, actions, seeds = environment.make_vec(70), random_actions(30, 70), spawn_seeds(3, 70)
     together = roll_out(whole, actions, 3)
@@ -106,7 +106,7 @@ def test_threads_change_nothing(options):
 
 
 @pytest.mark.parametrize("environment", [p for p in VECTORS if p.id in ("difference", "hypotheses", "continuous")])
-def test_what_is_remembered_is_all_that_the_next_step_goes_on_from(environment):
+def test_the_stored_arrays_determine_the_next_step(environment):
     envs, others = environment.make_vec(5), environment.make_vec(5)
     roll_out(envs, random_actions(30, 5))
     others.reset(seed=99)

@@ -26,7 +26,7 @@ def bank():
 
 
 def returns(reward, max_output, **options):
-    """Returns and early ends (inputs + 2, SYSTEMS): of the bank, of feedback along the velocity, and of no input."""
+    """Returns and early ends (inputs + 2, SYSTEMS) of the bank, of feedback along the velocity, and of zero input."""
     inputs = bank()
     count = len(inputs) + 2
     envs = gym.make_vec(
@@ -78,7 +78,7 @@ def test_what_was_gained_before_the_end_is_kept_otherwise():
 
 @pytest.mark.parametrize("reward", LEARNABLE)
 def test_the_registered_tracks_end_at_their_limit_and_never_diverge(reward):
-    """So no number of theirs depends on what a diverged step is worth."""
+    """Therefore none of their figures depends on the reward of a diverged step."""
     inputs = np.repeat(bank(), SYSTEMS, axis=0)
     envs = gym.make_vec(TRACK, num_envs=len(inputs), vectorization_mode="vector_entry_point", reward=reward)
     envs.reset(seed=0)

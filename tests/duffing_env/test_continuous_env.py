@@ -19,8 +19,8 @@ def test_the_fisher_information_is_refused_to_an_equation_that_the_plant_does_no
         ContinuousEnv(reward="fisher", estimator="nlarx")
 
 
-#: Left to the evidence, because a kernel is seconds of compilation: what a free energy, a free run and the information
-#: at the truth are is tested on the difference equation, and so is what rewards read of its beliefs.
+#: Only `make evidence` runs these, because a kernel takes seconds to compile: the rewards by free energy, free run and
+#: #: Fisher information are tested on the difference equation.
 EVIDENCE = ("free_energy", "simulation_error", "fisher")
 MEAN_FIELD = {"estimator": "nlarx", "factorisation": "mean_field"}
 FOLLOWED = [
@@ -71,7 +71,7 @@ def test_the_plant_does_not_depend_on_the_estimator():
     np.testing.assert_array_equal(*outputs)
 
 
-def test_the_first_observation_says_that_nothing_is_known_yet():
+def test_the_first_observation_shows_the_prior():
     env = gym.make(TRACK)
     observation, _ = env.reset(seed=0)
     np.testing.assert_allclose(observation[[*range(8), *range(14, 20)]], 0.0, rtol=0, atol=1e-6)

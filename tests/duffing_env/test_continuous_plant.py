@@ -94,18 +94,18 @@ FREE = dict.fromkeys(RATES[:3], 0.0)
 
 
 def noise_of_a_sample(draws, kind=KIND, **rows):
-    """(2, draws * LANES) what noise of 1 mV does to (x, x') in a sample [mV]."""
+    """Displacement of (x, x') by 1 mV of noise in a sample (2, draws * LANES) [mV]."""
     still = lanes(**rows)
     step(still, kind=kind)
     still = still[[PLACE["X_x"], PLACE["X_v"]]].copy()
-    by_row, told = lanes(**rows), []
+    by_row, noise_kicks = lanes(**rows), []
     start = {name: by_row[PLACE[name]].copy() for name in ("X_x", "X_v")}
     for _ in range(draws):
         for name, values in start.items():
             by_row[PLACE[name]] = values
         step(by_row, process_noise=1e-3, kind=kind)
-        told.append(1e3 * (by_row[[PLACE["X_x"], PLACE["X_v"]]] - still))
-    return np.concatenate(told, axis=1)
+        noise_kicks.append(1e3 * (by_row[[PLACE["X_x"], PLACE["X_v"]]] - still))
+    return np.concatenate(noise_kicks, axis=1)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.3])

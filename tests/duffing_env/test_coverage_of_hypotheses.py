@@ -30,14 +30,14 @@ def guessed(process, measurement):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("track", TRACKS)
-def test_with_noises_drawn_over_a_decade_each_they_do(track):
+def test_intervals_hold_with_noises_drawn_over_a_decade_each(track):
     assert 0.87 <= shown(track, 9, noise_range=10.0) <= 0.93
     shown(track, 1, noise_range=10.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("track", TRACKS)
-def test_with_priors_at_a_third_and_three_times_the_truth_they_do(track):
+def test_intervals_hold_with_priors_at_a_third_and_three_times_the_truth(track):
     assert 0.87 <= np.mean([shown(track, 9, **guessed(f, f)) for f in (1 / 3, 3.0)]) <= 0.93
     # A single estimator's are far too narrow or too wide.
     assert shown(track, 1, **guessed(1 / 3, 1 / 3)) < 0.87
@@ -46,7 +46,7 @@ def test_with_priors_at_a_third_and_three_times_the_truth_they_do(track):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("track", TRACKS)
-def test_where_the_truth_is_between_the_levels_they_are_too_narrow(track):
+def test_intervals_are_too_narrow_where_the_truth_is_between_the_levels(track):
     # docs/evidence/coverage.md names this as a limit: three levels of the noises' sum are coarse.
     cells = [(1 / 3, 1.0), (1.0, 1 / 3), (1 / 3, 3.0), (3.0, 1 / 3)]
     assert np.mean([shown(track, 9, **guessed(*cell)) for cell in cells]) < 0.87

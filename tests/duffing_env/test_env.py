@@ -46,7 +46,7 @@ def test_observations_are_given_away():
     assert not (env.step([1.0])[0] == 9.0).any()
 
 
-def test_the_first_observation_says_that_nothing_is_known_yet():
+def test_the_first_observation_shows_the_prior():
     env = DuffingEnv()
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
@@ -85,7 +85,7 @@ NO_NUMBERS = [
 ]  # fmt: skip
 
 
-def test_actions_that_are_no_number_are_refused_and_change_nothing():
+def test_actions_that_are_not_one_number_are_refused_and_change_nothing():
     env, untouched = DuffingEnv(**SHORT), DuffingEnv(**SHORT)
     for each in (env, untouched):
         each.reset(seed=0)
@@ -190,7 +190,7 @@ def test_specifications_travel_as_json():
 
 @pytest.mark.parametrize("travels", [False, True])
 def test_a_specification_takes_other_options(travels):
-    """What follows from the old ones is no limit of what is made with new ones."""
+    """Values derived from the old options do not limit an environment with new ones."""
     spec = gym.make("duffing_env/Short-v0", max_input=1e-3, max_output=0.5).spec
     assert spec.max_episode_steps == copy.deepcopy(spec).max_episode_steps == 48
     spec = EnvSpec.from_json(spec.to_json()) if travels else dataclasses.replace(spec)

@@ -1,4 +1,4 @@
-"""The reward ``expected_free_energy``: what is promised before the outcome, beside what is then gained."""
+"""The reward ``expected_free_energy``: expected information gains against achieved ones."""
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +8,7 @@ SYSTEMS, SAMPLES = 256, 256
 
 
 def sums(track="duffing_env/Amplitude-v0", systems=SYSTEMS, samples=SAMPLES, **options):
-    """Sums (samples, systems) so far of promises and of information gains, with uniform inputs; NaN after the end."""
+    """Cumulative expected and achieved gains (samples, systems) under uniform inputs; NaN after the end."""
     options = {"reward": "expected_free_energy", **options}
     envs = gym.make_vec(track, num_envs=systems, vectorization_mode="vector_entry_point", **options)
     envs.reset(seed=0)
@@ -41,7 +41,7 @@ KNOWN = {
         (EQUATION_1, {"max_slew": 0.02}),
     ],
 )
-def test_what_is_promised_is_gained_where_the_noises_are_known(track, options):
+def test_the_expected_gain_is_achieved_where_the_noises_are_known(track, options):
     promised, gained = sums(track, 8, 60, **KNOWN, **options)
     seen = ~np.isnan(promised)
     assert seen.sum() > 300
@@ -49,20 +49,20 @@ def test_what_is_promised_is_gained_where_the_noises_are_known(track, options):
     np.testing.assert_allclose(promised[seen], gained[seen], rtol=0, atol=1e-6)
 
 
-def test_a_promise_is_for_the_sample_and_not_for_what_drift_forgets():
+def test_the_expected_gain_counts_again_what_drift_destroyed():
     promised, gained = sums(systems=8, samples=60, drift=0.01, **KNOWN)
     assert (promised[~np.isnan(promised)] >= 0).all()
-    assert np.nansum(promised) > np.nansum(gained) + 8 * 0.5  # paid again for what was known already
+    assert np.nansum(promised) > np.nansum(gained) + 8 * 0.5  # the same information is paid again
 
 
-def test_promises_are_kept_on_average_by_calibrated_beliefs():
+def test_expected_gains_are_achieved_on_average_by_calibrated_beliefs():
     promised, gained = (np.nansum(column, axis=0) for column in sums())
     assert promised.mean() == pytest.approx(17.79, abs=0.01)  # the figures of `duffing_env.rewards.named_rewards`
     assert abs((promised - gained).mean()) < 0.05
 
 
 @pytest.mark.slow  # slow for the reason at `test_kernel.PAIRS`
-def test_promises_are_not_kept_by_a_mean_field():
+def test_expected_gains_are_not_achieved_by_a_mean_field():
     promised, gained = (np.nansum(column, axis=0) for column in sums(factorisation="mean_field"))
     assert promised.mean() == pytest.approx(10.9, abs=0.05)
     assert gained.mean() == pytest.approx(16.5, abs=0.05)

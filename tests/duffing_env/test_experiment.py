@@ -122,7 +122,7 @@ def test_settings_are_the_options():
     np.testing.assert_allclose(setup.prior_log_precisions, [-2 * np.log(1e-3), -2 * np.log(2e-3)], rtol=1e-14)
 
 
-def test_what_the_kernel_gets_is_the_setup():
+def test_kernel_params_survive_packing():
     experiment = SimulatedExperiment(max_rms=0.03, jump=0.2, drift=0.01, terminated_return=-3.0)
     setup = experiment.kernel_params._replace(hold=4)
     unpack = compile_unpacker(experiment.kernel_spec)
@@ -155,7 +155,7 @@ def test_the_first_belief_is_the_prior(factorisation):
     np.testing.assert_allclose(setup.prior_inverse_std, np.diag(prior.coefficients_cov) ** -0.5, rtol=1e-14)
 
 
-def test_a_continuous_experiment_is_told_of_its_estimator():
+def test_a_continuous_experiment_passes_its_estimator_to_the_kernel():
     options = {"spread": 0.2, "process_noise": 1e-3, "measurement_noise": 2e-3, "noise_shape": 5.0}
     ode = ContinuousExperiment(**options)
     assert (ode.kernel_spec.plant_model, ode.kernel_spec.belief_model, ode.kernel_spec.degree) == (
@@ -184,7 +184,7 @@ def test_mean_field_is_for_the_difference_equation():
         ContinuousExperiment(factorisation="mean_field")
 
 
-def test_a_replay_is_told_of_the_record(record):
+def test_a_replay_passes_the_record_to_the_kernel(record):
     experiment = ReplayExperiment(input_delay=1, nonlinear=False, prior="published_run")
     kind, setup = experiment.kernel_spec, experiment.kernel_params
     assert (kind.plant_model, kind.belief_model) == (None, difference("linear"))

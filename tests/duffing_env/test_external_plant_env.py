@@ -1,4 +1,4 @@
-"""A rig around its plant: it gets what is promised, and the estimator gets what it gives."""
+"""A rig around its plant: the plant gets the documented inputs, and the estimator gets the plant's outputs."""
 
 import threading
 from contextlib import nullcontext
@@ -27,7 +27,7 @@ GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
 
 
 class Scripted:
-    """Gives the outputs of a list in turn; an exception in the list is raised."""
+    """A plant that returns the outputs of a list in turn, and raises the exceptions in it."""
 
     def __init__(self, outputs):
         self.outputs = outputs
@@ -115,8 +115,8 @@ def test_a_plant_that_fails_ends_the_episode_flagged_with_the_belief_before(outp
     assert (reward, terminated, truncated, info["diverged"], info["information_gain"]) == (0.0, True, False, True, 0.0)
     assert observation in env.observation_space
     np.testing.assert_array_equal(env.belief.record, before.record)
-    told = f"TypeError: step must give one number, but gave {output!r}" if is_bug else None
-    assert env.plant_error == ("OSError: cable" if isinstance(output, OSError) else told)
+    message = f"TypeError: step must give one number, but gave {output!r}" if is_bug else None
+    assert env.plant_error == ("OSError: cable" if isinstance(output, OSError) else message)
     with pytest.raises(ResetNeeded):
         env.step([0.5])
     np.testing.assert_array_equal(env.reset()[0], first)
@@ -245,14 +245,14 @@ def test_a_model_without_the_cubic_term_recovers_from_a_plant_that_fails():
     # Mean field keeps rows of a θ2 that the model does not have: they must not stay NaN.
     prior = silverbox_prior(difference("linear")).with_factorisation("mean_field")
     env = around(Scripted([0.01, 1e200]), "mean_field", prior=prior, max_output=1.0)
-    told = []
+    results = []
     for _ in range(2):
         env.reset()
-        told.append([env.step([0.5])[0], env.step([0.5])[4]["diverged"]])
-    np.testing.assert_array_equal(told[0][0], told[1][0])
-    assert told[0][1]
-    assert told[1][1]
-    assert not np.array_equal(told[1][0], env.reset()[0])
+        results.append([env.step([0.5])[0], env.step([0.5])[4]["diverged"]])
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    assert results[0][1]
+    assert results[1][1]
+    assert not np.array_equal(results[1][0], env.reset()[0])
 
 
 def test_several_plants_are_several_environments():

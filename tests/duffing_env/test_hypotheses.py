@@ -1,4 +1,4 @@
-"""Hypotheses about the noises in an environment: the mixture that the online estimator has."""
+"""Noise hypotheses in an environment: the same mixture as in the online estimator."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def test_so_does_one_on_the_differential_equation(reward):
 
 
 def close(first, second):
-    """Two beliefs that are the same to rounding."""
+    """Whether two beliefs are equal to rounding."""
     std = np.sqrt(np.diag(second.coefficients_cov))
     np.testing.assert_allclose(first.coefficients_mean / std, second.coefficients_mean / std, rtol=0, atol=1e-9)
     scale = np.outer(std, std)
@@ -121,7 +121,7 @@ def test_blocks_that_more_members_share_with_their_neighbours():
             np.testing.assert_array_equal(one[31:36], other)
 
 
-def test_a_member_that_overflowed_has_no_say():
+def test_an_overflowed_member_has_no_weight():
     envs, plain = (DuffingVectorEnv(6, **OPTIONS) for _ in range(2))
     actions = random_actions(40, 6)
     roll_out(envs, actions[:10])
@@ -155,7 +155,7 @@ def test_members_stay_as_an_episode_left_them_that_ended_within_a_hold(size):
             np.testing.assert_array_equal(of_held, of_sampled)
 
 
-def test_what_cannot_weigh_hypotheses_says_so():
+def test_estimators_without_noise_hypotheses_are_refused():
     numbers = [0, -1, 2.0, True, None, "3", 100]
     message = "noise_hypotheses must be a whole number from 1 to 99, but is"
     assert_refused((lambda n=n: SimulatedExperiment(noise_hypotheses=n), message) for n in numbers)

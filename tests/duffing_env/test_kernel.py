@@ -23,8 +23,8 @@ COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 
 
-#: What rewards read of a mean-field belief is what they read of another: kernels that are left to the evidence. The
-#: free energy of a structured belief is compared over the record, in test_replay.py.
+#: Only `make evidence` runs these kernels: rewards use a mean-field belief as they use any other. The free energy of a
+#: #: structured belief is compared over the record, in test_replay.py.
 PAIRS = [("structured", reward) for reward in REWARDS if reward != "free_energy"]
 PAIRS += [
     ("mean_field", "free_energy"),
@@ -111,7 +111,7 @@ def test_oscillators_are_log_uniform_about_the_twin(spread):
 
 
 def test_prior_has_the_moments_of_the_oscillators():
-    # What makes the first belief calibrated: 4000 draws stand for the quadrature that the prior is made by.
+    # The first belief is calibrated: 4,000 draws replace the quadrature of the prior.
     size = 4000
     batch = Batch(SimulatedExperiment(), size, RESET_MANUALLY)
     for row, seed in enumerate(spawn_seeds(1, size)):

@@ -55,7 +55,7 @@ def normals():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**63])
-def test_draws_are_those_of_numpy(seed):
+def test_draws_equal_numpy(seed):
     words = new_stream_words(np.random.default_rng(seed)).view(np.uint64)
     expected = numpy_stream(words)
     for _ in range(1000):
@@ -76,7 +76,7 @@ def test_any_word_survives_as_a_float():
         assert float_to_word(word_to_float(np.uint64(word))) == word
 
 
-def test_streams_in_blocks_are_those_of_numpy():
+def test_streams_in_blocks_equal_numpy():
     # 40,000 words pass through float64 rows here, some forty of which are NaN to a float64.
     batch = make_batch(70, seed=3)
     expected = [

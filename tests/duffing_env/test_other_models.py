@@ -17,7 +17,7 @@ from estimator.rigs.units import Scales
 PENDULA = {"p1": 14.7, "p2": 0.5, "p3": 3.0}
 
 
-def test_its_observation_has_what_two_sensors_tell():
+def test_its_observation_has_entries_for_two_sensors():
     env = OWN.make()
     assert env.observation_space.shape == (2 * 3 + 3 + 2 + 2 * 2 + 4,)
     first, _ = env.reset(seed=0)
@@ -49,7 +49,7 @@ def test_its_beliefs_are_calibrated():
 
 
 def test_it_is_played_and_believed():
-    """A plant with a bend beside the reference: what both sensors show, and that a belief finds its truth."""
+    """A plant with a nonlinear sensor against the reference: both outputs, and the convergence of a belief."""
     env = OWN.make(horizon=64, max_output=6.0)
     env.reset(seed=0)
     plant, truth = Plant.of(SEEN_TWICE), np.array([env.truth[name] for name in SEEN_TWICE.coefficients])
@@ -81,7 +81,7 @@ def test_the_prior_of_a_range_is_as_wide_as_the_range_for_several_sensors_too():
 
 
 @pytest.mark.slow  # a kernel of its own
-def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
+def test_noise_hypotheses_of_a_nonlinear_model_use_sigma_points():
     """To first order, 0.80 of the intervals cover under this input, and NEES per coefficient is 2.5."""
     from agents.evaluation.policy_evaluation import evaluate_policies
 
@@ -92,8 +92,8 @@ def test_hypotheses_about_a_model_that_bends_are_moved_by_sigma_points():
 
 
 def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
-    told = {"system": "pendulum", "mean": PENDULA, "std": {"p1": 0.3, "p2": 0.1, "p3": 0.3}}
+    options = {"system": "pendulum", "mean": PENDULA, "std": {"p1": 0.3, "p2": 0.1, "p3": 0.3}}
     with pytest.raises(ValueError, match=r"plant_spread must be 0 or left out where std gives .* but is 0.1"):
-        ModelEnv(**told, plant_spread=0.1)
-    assert not ModelExperiment(**told, plant_spread=0.0).kernel_params.parameter_stds.any()
-    assert ModelExperiment(**told).kernel_params.parameter_stds.tolist() == [0.3, 0.1, 0.3]
+        ModelEnv(**options, plant_spread=0.1)
+    assert not ModelExperiment(**options, plant_spread=0.0).kernel_params.parameter_stds.any()
+    assert ModelExperiment(**options).kernel_params.parameter_stds.tolist() == [0.3, 0.1, 0.3]

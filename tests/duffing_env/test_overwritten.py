@@ -41,7 +41,7 @@ def test_packages_of_ours_are_ours(site, monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["from .run import Agent  # theirs\n", None])
-def test_a_package_that_is_written_over_is_told(site, monkeypatch, text):
+def test_a_package_that_is_overwritten_is_reported(site, monkeypatch, text):
     write_over(site, "agents", text)
     monkeypatch.setattr(sys, "path", [str(site)])
     message = overwrite_message("agents", site)

@@ -19,13 +19,13 @@ PARAMETERS = ("m", "c", "a", "b")
 
 
 def gain(before, after, u, y, truth):
-    """A reward: the information gain, once more."""
+    """A custom reward that equals the information gain."""
     return 0.5 * (np.linalg.slogdet(before.coefficients_cov)[1] - np.linalg.slogdet(after.coefficients_cov)[1])
 
 
 @numba.njit
 def compiled(before, after, u, y, truth):
-    """The same, for one environment."""
+    """The same reward, compiled for one environment."""
     return after.mean[0] + before.noises[0] + u + y + truth.m + truth.b
 
 
@@ -130,7 +130,7 @@ BAD = [
     ({"prior": 3}, "prior must be an estimator.Belief or None, but is 3"),
     ({"prior": silverbox_prior(difference("linear"))}, "prior must be of the model 'difference"),
 ]
-#: An array is no name.
+#: Arrays in place of names.
 NO_NAMES = [
     ("Amplitude-v0", "observation", np.ones(3)),
     ("Amplitude-v0", "reward", np.ones(3)),
@@ -161,9 +161,9 @@ def test_an_observation_keeps_its_number_of_entries():
         env.step([0.5])
 
 
-def test_a_reward_that_is_none_is_refused():
+def test_a_function_that_is_no_reward_is_refused():
     def step_with(given):
-        envs = DuffingVectorEnv(3, reward=lambda *told: given)
+        envs = DuffingVectorEnv(3, reward=lambda *arguments: given)
         envs.reset(seed=0)
         envs.step(np.zeros((3, 1)))
 

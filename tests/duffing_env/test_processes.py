@@ -1,4 +1,4 @@
-"""Threads and processes: environments of their own give what they give one after the other, however they are shared."""
+"""Threads and processes: environments in parallel give the same results as one after the other."""
 
 import os
 import subprocess
@@ -19,13 +19,13 @@ from duffing_env.vector_env import DuffingVectorEnv
 
 def play(rows, seed, threads=1, steps=40):
     "The digest of all that an environment gave."
-    envs, told = DuffingVectorEnv(rows, threads=threads, horizon=16), hashlib.sha256()
+    envs, digest = DuffingVectorEnv(rows, threads=threads, horizon=16), hashlib.sha256()
     rng = np.random.default_rng(seed)
     envs.reset(seed=seed)
     for _ in range(steps):
         for given in envs.step(rng.uniform(-1, 1, (rows, 1)).astype(np.float32))[:4]:
-            told.update(np.ascontiguousarray(given))
-    return told.hexdigest()
+            digest.update(np.ascontiguousarray(given))
+    return digest.hexdigest()
 
 def make():
     return gym.make("duffing_env/Short-v0")
@@ -33,17 +33,17 @@ def make():
 def gather(kind, workers):
     "All that single environments in a vector of Gymnasium's gave."
     envs = kind([make] * workers)
-    told = [envs.reset(seed=5)[0]]
+    results = [envs.reset(seed=5)[0]]
     actions = np.random.default_rng(0).uniform(-1, 1, (40, workers, 1)).astype(np.float32)
     for action in actions:
-        told += envs.step(action)[:4]
+        results += envs.step(action)[:4]
     envs.close()
-    return [np.array(given) for given in told]
+    return [np.array(given) for given in results]
 """
 
 
 def run(program, **variables):
-    """What a program says on stdout, in a process of its own."""
+    """The stdout of a program in a process of its own."""
     finished = subprocess.run(
         [sys.executable, "-c", PLAY + program], capture_output=True, text=True, cwd=ROOT, env=os.environ | variables
     )
@@ -93,8 +93,8 @@ if hasattr(os, 'fork'):
     forked = os.waitpid(child, 0)[1] == 0
 print(forked, play(70, 3, 2) == expected)
 """
-    *told, used, forked, afterwards = run(program, NUMBA_THREADING_LAYER=layer, NUMBA_NUM_THREADS="2")
-    for some in (told[:16], told[16:]):
+    *results, used, forked, afterwards = run(program, NUMBA_THREADING_LAYER=layer, NUMBA_NUM_THREADS="2")
+    for some in (results[:16], results[16:]):
         assert some[:8] == some[8:]
         assert len(set(some)) == 8
     assert used in ("omp", "tbb", "workqueue")  # else all this would hold of one thread alone
@@ -112,7 +112,7 @@ def test_three_processes_that_compile_at_once_agree(tmp_path):
     ]
     said = [each.communicate(timeout=1800) for each in running]
     assert [each.returncode for each in running] == [0, 0, 0], said
-    assert {told.strip() for told, _ in said} == set(run("print(play(70, 3))"))
+    assert {printed.strip() for printed, _ in said} == set(run("print(play(70, 3))"))
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
     finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=variables)
     assert finished.stdout == said[0][0]

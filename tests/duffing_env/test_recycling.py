@@ -7,7 +7,7 @@ import numpy as np
 from duffing_env.storage.array_pool import ArrayPool
 
 
-def test_what_is_held_is_not_given_out_again() -> None:
+def test_an_array_with_references_is_not_reused() -> None:
     arrays = ArrayPool((3, 2), np.float32)
     held = [arrays.acquire() for _ in range(2 * ArrayPool.MAX_ARRAYS)]
     assert len({id(array) for array in held}) == len(held)
@@ -22,7 +22,7 @@ def test_a_view_holds_its_array() -> None:
     np.testing.assert_array_equal(view, 7.0)
 
 
-def test_what_nobody_holds_is_given_out_again() -> None:
+def test_an_array_without_references_is_reused() -> None:
     arrays = ArrayPool((3, 2), np.float64)
     places, held = set(), None
     for _ in range(20):

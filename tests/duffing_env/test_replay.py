@@ -1,4 +1,4 @@
-"""The record through the environment: what the estimator gets is what it gets from the record itself."""
+"""The record through the environment: the estimator gets the same samples as from the record itself."""
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,7 @@ OPTIONS = {"reward": "free_energy"}
 
 
 def play(env, policy, samples):
-    """Let the policy play; gives the steps."""
+    """Let the policy play; return the steps."""
     observation, _ = env.reset(seed=0)
     state, steps = None, []
     for _ in range(samples):

@@ -24,7 +24,7 @@ COEFFICIENTS = ("theta1", "theta2", "theta3", "eta")
 TWIN = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 HORIZON, MAX_OUTPUT = 10, 0.6
 ACTIVE = {True: [0, 1, 2, 3], False: [0, 2, 3]}
-WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  # their hooks leave what they are worth
+WORKED = ("free_energy", "fisher", "expected_free_energy", "simulation_error")  # their hooks store a level
 
 
 @cache
@@ -36,7 +36,7 @@ def payer(kind):
 
 
 class Lanes:
-    """A block of which every lane believes the prior and has the twin for its truth."""
+    """A block in which every lane has the prior as belief and the twin as truth."""
 
     def __init__(self, nonlinear=True, reward="information_gain"):
         self.model = difference("paper" if nonlinear else "linear")
@@ -97,7 +97,7 @@ def random_belief(rng):
 
 
 @pytest.mark.parametrize("nonlinear", [True, False])
-def test_appraisal_is_that_of_a_gaussian(nonlinear):
+def test_information_measures_equal_a_gaussians(nonlinear):
     for seed in range(20):
         assert_appraised_as_a_gaussian(nonlinear, seed)
 
@@ -119,7 +119,7 @@ def assert_appraised_as_a_gaussian(nonlinear, seed):
     density = multivariate_normal(mean[active], cov[np.ix_(active, active)]).logpdf(lanes.truth)
     _, log_det = np.linalg.slogdet(cov[np.ix_(active, active)])
     np.testing.assert_allclose(lanes["LOG_DET"], log_det, rtol=1e-8)
-    # The kernel leaves the constant away, which no difference of two densities has.
+    # The kernel omits the constant, which cancels in differences of log densities.
     np.testing.assert_allclose(lanes["LOG_DENSITY"] - 0.5 * len(active) * np.log(2 * np.pi), density, rtol=1e-7)
 
     estimate = to_parameters(mean)[: len(active)]
@@ -128,7 +128,7 @@ def assert_appraised_as_a_gaussian(nonlinear, seed):
 
 
 @pytest.mark.parametrize("nonlinear", [True, False])
-def test_halving_the_covariance_is_worth_half_a_bit_for_each_coefficient(nonlinear):
+def test_halving_the_covariance_pays_half_a_bit_per_coefficient(nonlinear):
     lanes = Lanes(nonlinear)
     for name in lanes.place:
         if name.startswith("P_") and not {"x1", "x2"} & set(name.split("_")):
@@ -141,7 +141,7 @@ def test_halving_the_covariance_is_worth_half_a_bit_for_each_coefficient(nonline
 
 
 @pytest.mark.parametrize("reward", REWARDS)
-def test_a_step_is_worth_the_increase_by_the_named_measure(reward):
+def test_a_step_pays_the_increase_of_the_named_measure(reward):
     lanes = Lanes(reward=reward)
     before = lanes.belief
     lanes.set_coefficients(*random_belief(np.random.default_rng(1)))
@@ -177,7 +177,7 @@ def test_the_error_of_each_parameter_is_capped():
     lanes.set_coefficients(far, lanes.belief.coefficients_cov)
     lanes.appraise()
     np.testing.assert_allclose(lanes["PARAMETER_ERROR"], 0.5, rtol=1e-12)  # m and a are off by more than themselves
-    lanes["eta"][:] = 0.0  # as if the input had no effect: no parameter can be told
+    lanes["eta"][:] = 0.0  # as if the input had no effect: no parameter is identifiable
     lanes.appraise()
     np.testing.assert_array_equal(lanes["PARAMETER_ERROR"], 1.0)
 
@@ -195,7 +195,7 @@ def test_episodes_end_at_the_limit_or_at_the_horizon():
 
 
 def impossible():
-    """Names of rows and values that no belief and no plant may have."""
+    """Names of rows, and values that are invalid for a belief or a plant."""
     names = belief_rows(difference())
     variances = [f"P_{name}_{name}" for name in difference().names]
     for name in (*names[:6], *variances, "GAMMA_RATE", "XI_RATE_y", "X_x1", "Y_y"):
@@ -209,7 +209,7 @@ def impossible():
 
 
 @pytest.mark.parametrize("reward", REWARDS)
-def test_what_cannot_be_ends_the_episode_and_is_worth_nothing(reward):
+def test_impossible_states_end_the_episode_and_pay_nothing(reward):
     for name, value in impossible():
         lanes = Lanes(reward=reward)
         lanes["ELAPSED_SAMPLES"][:] = HORIZON - 1
@@ -236,7 +236,7 @@ def test_work_that_is_not_finite_ends_the_episode(reward):
         np.testing.assert_array_equal(lanes["REWARD"], 0.0)
 
 
-def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
+def test_an_action_off_the_record_ends_the_episode_and_pays_nothing():
     lanes = Lanes(reward="log_posterior")
     lanes.set_coefficients(*random_belief(np.random.default_rng(2)))
     lanes["OFF_RECORD"][1] = 1.0
@@ -248,7 +248,7 @@ def test_an_action_off_the_record_ends_the_episode_and_is_worth_nothing():
 
 
 def three_steps(**options):
-    """Rewards (3, LANES) of steps that are worth 1, 2 and 3, less a cost of ½; lane 1 is terminated by the last."""
+    """Rewards (3, LANES) of steps of 1, 2 and 3 minus a cost of ½; the last step terminates lane 1."""
     lanes, paid = Lanes(reward="fisher"), []
     lanes["ELAPSED_SAMPLES"][:] = HORIZON - 3
     lanes["INPUT"][:] = 0.1
@@ -270,7 +270,7 @@ def test_a_terminal_reward_is_the_sum_at_the_end():
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_an_episode_that_is_terminated_returns_what_was_said(terminal):
+def test_a_terminated_episode_returns_the_given_number(terminal):
     for worth in (-10.0, 0.0, 2.5):
         kept, paid = three_steps(terminal=terminal), three_steps(terminal=terminal, terminated_return=worth)
         np.testing.assert_allclose(paid.sum(axis=0)[1], worth, rtol=0, atol=1e-14)
@@ -278,7 +278,7 @@ def test_an_episode_that_is_terminated_returns_what_was_said(terminal):
         np.testing.assert_array_equal(paid, kept)  # and nothing else is touched
 
 
-def test_an_episode_that_diverges_returns_what_was_said():
+def test_a_diverged_episode_returns_the_given_number():
     lanes = Lanes(reward="fisher")
     lanes["HOOK_REWARD"][:] = 4.0
     lanes.settle(terminated_return=-1.0)

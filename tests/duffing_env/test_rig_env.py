@@ -63,7 +63,7 @@ def test_intervals_hold_the_truth_with_noises_unknown():
             for belief, truth, _ in endings
         ]
     )
-    # The pooled share of six coefficients, which are not independent: as uncertain as one.
+    # The pooled share of six dependent coefficients is as uncertain as the share of one.
     assert abs((np.abs(scaled) < 1.645).mean() - 0.9) < 4 * np.sqrt(0.09 / 256)
     errors = [abs(belief.parameters()["m"][0] / truth.m - 1) for belief, truth, _ in endings]
     assert np.median(errors) < 0.003
@@ -83,7 +83,7 @@ def test_around_the_plant_inputs_and_outputs_are_in_its_units():
     mean, std, unit = env.belief.parameters()["m"]
     assert abs(mean - bench.truth["m"]) < 5 * std < 0.2
     assert unit == "kg"
-    # What the estimator of the same rig makes of the same pairs: those of an environment.
+    # The estimator of the same rig has the environment's beliefs after the same pairs.
     estimator = OnlineEstimator(rig=Rig.from_dict(RIG.to_dict() | {"delay": -1}))
     estimator.run(bench.inputs, bench.outputs)
     np.testing.assert_allclose(env.belief.coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The twins' constants are what the record gives."""
+"""The twins' constants equal the identification of the record."""
 
 import pytest
 
@@ -17,6 +17,6 @@ def test_the_twin_is_identified_from_the_record(record):
 
 def test_the_continuous_twin_is_identified_from_the_record(record):
     found = identify_continuous_twin(record)
-    # The constants are those of the tracks and stay. Since they were identified the estimator weighs the two noises a
-    # little otherwise, which on this record, no oscillator of Eq. (1), moves the cubic term by 4e-4 of it.
+    # The tracks fix the constants. The present estimator weights the two noises differently, which on this record (no #
+    # exact oscillator of Eq. (1)) changes the cubic term by 4e-4 of its value.
     assert dict(found) == pytest.approx(dict(SILVERBOX_ODE_TWIN), rel=5e-4)

@@ -59,7 +59,7 @@ def test_noises_are_log_uniform_about_what_is_given_and_independent():
     assert np.abs(np.corrcoef(drawn)[np.triu_indices(len(drawn), 1)]).max() < 4 / np.sqrt(4000)
 
 
-def test_they_change_nothing_else_of_the_plant_and_are_what_it_has():
+def test_drawn_noises_are_the_plants_noises_and_change_nothing_else():
     loud, plain = begun(100, noise_range=10.0), begun(100)
     for name in PARAMETERS:
         np.testing.assert_array_equal(loud.truth()[name], plain.truth()[name])
@@ -72,7 +72,7 @@ def test_they_change_nothing_else_of_the_plant_and_are_what_it_has():
     np.testing.assert_allclose(loud.row_values("Y_y") - x, shown, rtol=0, atol=1e-17)
 
 
-def test_the_truth_tells_them_at_the_end_of_an_episode():
+def test_the_truth_has_the_noises_at_the_end_of_an_episode():
     env = DuffingEnv(noise_range=10.0, horizon=3)
     env.reset(seed=0)
     for _ in range(3):
@@ -109,7 +109,7 @@ def test_the_prior_is_centred_at_the_guess():
 
 
 def test_the_guess_of_further_sensors_is_as_far_off_as_that_of_the_first():
-    told = TRACKS["duffing_env/Pendulum-v0"]["kwargs"]
-    belief = ModelExperiment(**told, sensor_noise=(4e-6,), measurement_noise_guess=3e-6).prior_belief
+    settings = TRACKS["duffing_env/Pendulum-v0"]["kwargs"]
+    belief = ModelExperiment(**settings, sensor_noise=(4e-6,), measurement_noise_guess=3e-6).prior_belief
     stds = np.sqrt(belief.noises[1::2] / belief.noises[::2])
-    np.testing.assert_allclose(stds, [told["process_noise"], 3e-6, 12e-6], rtol=1e-12)
+    np.testing.assert_allclose(stds, [settings["process_noise"], 3e-6, 12e-6], rtol=1e-12)

@@ -56,7 +56,7 @@ def test_an_episode_ends_with_its_own_belief_and_truth(mode):
     assert (envs.truth.m == truth.m).all() != same_step
 
 
-def test_copies_are_given_out_unless_told_otherwise():
+def test_copies_are_returned_by_default():
     action = np.ones((2, 1), dtype=np.float32)
     envs = DuffingVectorEnv(2)
     first, _ = envs.reset(seed=0)
@@ -248,12 +248,12 @@ def test_a_system_of_choice(options):
     drawn.reset(seed=99)
     drawn.reset(seed=3, options={"truth": truth})
     assert drawn.truth == truth
-    assert_same([drawn.step(action)[:4] for action in actions], [told[:4] for told in expected[1:]])
+    assert_same([drawn.step(action)[:4] for action in actions], [step_results[:4] for step_results in expected[1:]])
     single.reset(seed=spawn_seeds(3, 40)[35], options={"truth": {name: truth[name][35] for name in truth}})
-    for action, told in zip(actions[:, 35], expected[1:], strict=True):
+    for action, step_results in zip(actions[:, 35], expected[1:], strict=True):
         step = single.step(action)
-        np.testing.assert_array_equal(step[0], told[0][35])
-        assert step[1] == told[1][35]
+        np.testing.assert_array_equal(step[0], step_results[0][35])
+        assert step[1] == step_results[1][35]
         if step[2] or step[3]:
             break
     # Another system, with the same noise; only of the rows that are reset, and without noises as they are drawn.
@@ -297,14 +297,14 @@ def test_bad_options_of_a_reset_are_refused_and_change_nothing():
 
 def test_the_same_seed_gives_other_experiments_in_each_branch():
     actions = random_actions(20, 6)
-    plain, told = DuffingVectorEnv(6), {branch: DuffingVectorEnv(6, branch=branch) for branch in SEED_BRANCHES}
-    reference, found = roll_out(plain, actions), {branch: roll_out(envs, actions) for branch, envs in told.items()}
+    plain, by_branch = DuffingVectorEnv(6), {branch: DuffingVectorEnv(6, branch=branch) for branch in SEED_BRANCHES}
+    reference, found = roll_out(plain, actions), {branch: roll_out(envs, actions) for branch, envs in by_branch.items()}
     assert_same(reference, found["train"])
-    masses = np.concatenate([envs.truth.m for envs in told.values()])
+    masses = np.concatenate([envs.truth.m for envs in by_branch.values()])
     assert len(set(masses.tolist())) == 18
     single = DuffingEnv(branch="test")
     single.reset(seed=spawn_seeds(0, 6)[3])
-    assert single.truth.m == told["test"].truth.m[3]
+    assert single.truth.m == by_branch["test"].truth.m[3]
     with pytest.raises(ValueError, match="branch must be one of"):
         DuffingEnv(branch="exam")
 
@@ -312,7 +312,7 @@ def test_the_same_seed_gives_other_experiments_in_each_branch():
 NO_SEEDS = [[1, 2, -1], [1, 2, 2.5], [1, 2], -1, "seed", 2.5, [1, 2, True], [1, 2, 10**60], (1, 2, "3"), np.array(3)]
 
 
-def test_a_seed_that_is_none_changes_nothing():
+def test_an_invalid_seed_changes_nothing():
     envs, untouched = DuffingVectorEnv(3, **BOTH_ENDS), DuffingVectorEnv(3, **BOTH_ENDS)
     for each in (envs, untouched):
         each.reset(seed=0)

@@ -51,7 +51,7 @@ def test_a_limit_of_steps_truncates_as_gymnasium_does(limit):
     assert gym.make(TRACK, max_episode_steps=9).spec.max_episode_steps == 9
 
 
-def test_the_specification_tells_the_limit_and_cuts_no_longer_horizon():
+def test_the_specification_states_the_limit_and_cuts_no_longer_horizon():
     for horizon in (256, 400):
         env = gym.make(TRACK, horizon=horizon, max_input=1e-3)
         assert env.spec.max_episode_steps == gym.make_vec(TRACK, num_envs=2, horizon=horizon).spec.max_episode_steps
@@ -69,13 +69,13 @@ def test_episode_statistics_of_gymnasium(mode):
     reference = DuffingVectorEnv(4, autoreset_mode=mode, **BOTH_ENDS)
     actions = random_actions(100, 4)
     returns, lengths, being_reset, ended = np.zeros(4), np.zeros(4, dtype=int), np.zeros(4, dtype=bool), 0
-    for told, (_, rewards, terminated, truncated, _) in zip(
+    for infos, (_, rewards, terminated, truncated, _) in zip(
         roll_out(envs, actions)[1:], roll_out(reference, actions)[1:], strict=True
     ):
         returns, lengths = returns + rewards, lengths + ~being_reset
         finished = terminated | truncated
         if finished.any():
-            episode = told[-1]["episode"]
+            episode = infos[-1]["episode"]
             np.testing.assert_allclose(episode["r"][finished], returns[finished], rtol=1e-12)
             np.testing.assert_array_equal(episode["l"][finished], lengths[finished])
         returns, lengths = np.where(finished, 0, returns), np.where(finished, 0, lengths)

@@ -34,7 +34,7 @@ class Moments(reference.mean_field.Moments):
 
     @classmethod
     def like(cls, moments):
-        """The same of other moments."""
+        """The same for other moments."""
         return cls(moments.mean, moments.cov, moments.gamma, moments.xi)
 
     @property
@@ -78,7 +78,7 @@ def from_rates(coefficients):
 
 
 def log_det(cov):
-    """log det of a covariance, from that of its correlations, which are better conditioned."""
+    """log det of a covariance, from its correlations, which are better conditioned."""
     std = np.sqrt(np.diag(cov))
     return np.linalg.slogdet(cov / np.outer(std, std))[1] + 2 * np.log(std).sum()
 
@@ -185,7 +185,7 @@ class TwinEnv:
             self.jump_at = int(self.horizon * (0.25 + 0.5 * self.stream.uniform()))
             self.jump_factor = (1.0 - self.jump) * ((1.0 + self.jump) / (1.0 - self.jump)) ** self.stream.uniform()
         self.belief = self.first_belief
-        self.ideal_cov = self.first_belief.cov  # for one who knows the truth
+        self.ideal_cov = self.first_belief.cov  # with the true parameters
         self._worth = self._appraise()
         return self.observation()
 
@@ -244,7 +244,7 @@ class TwinEnv:
         return 0.5 * (log_det(before[2:, 2:]) - log_det(self.ideal_cov[2:, 2:]))
 
     def _expected_gain(self):
-        """½ log det C less that after an output, whatever it is: a Kalman step with the noises as believed."""
+        """Decrease of ½ log det C by an output of any value: a Kalman step with the believed noises."""
         belief = self.belief
         cov = predicted(belief.cov, self._model_step(belief.mean), belief.gamma[1] / belief.gamma[0])
         after = seen(cov, belief.xi[1] / belief.xi[0]).cov
@@ -261,7 +261,7 @@ class TwinEnv:
         return np.array(values)
 
     def _appraise(self):
-        """What the belief is worth by each reward that is a difference: a step's reward is its increase."""
+        """The level of every reward that is a difference: a step's reward is its increase."""
         mean, true = self.belief.mean[2:], self.to_coefficients(self.truth)
         truth = np.array([getattr(self.truth, name) for name in PARAMETERS])
         worth = {
@@ -338,7 +338,7 @@ class TwinContinuousEnv(TwinEnv):
 
 
 def assert_beliefs_agree(actual, expected):
-    """To rounding: the coefficients beside their standard deviations, the state beside a volt."""
+    """Compare beliefs to rounding: coefficients relative to their standard deviations, the state relative to 1 V."""
     mean, cov = expected.coefficients
     std = np.sqrt(np.diag(cov))
     np.testing.assert_allclose(actual.coefficients_mean / std, mean / std, rtol=0, atol=1e-9)
@@ -349,7 +349,7 @@ def assert_beliefs_agree(actual, expected):
 
 
 def assert_env_follows_twin(env, twin, reward, seed, episodes=2):
-    """Play random inputs, some beyond the limits; gives the flags with which the episodes ended."""
+    """Play random inputs, some beyond the limits; return the flags with which the episodes ended."""
     twin.runs_freely = reward == "simulation_error"
     rng = np.random.default_rng(seed)
     endings = []

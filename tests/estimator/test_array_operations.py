@@ -7,7 +7,7 @@ from tables import table
 from estimator.compilation.array_operations import aligned_matrix, copy, copy_scaled, fill, index_of_max
 
 
-def test_numbers_go_where_they_are_told():
+def test_numbers_are_copied_to_their_places():
     into = np.zeros(5)
     copy(into, 2, np.array([1.0, 2.0, 3.0]), 2)
     np.testing.assert_array_equal(into, [0, 0, 1, 2, 0])
@@ -18,7 +18,7 @@ def test_numbers_go_where_they_are_told():
     np.testing.assert_array_equal(matrix, [[0, 2], [4, 6]])
 
 
-def test_the_highest_is_the_first_of_its_like():
+def test_index_of_max_is_the_first_of_equal_values():
     values = np.array([1.0, 3.0, 3.0, 9.0])
     assert index_of_max(values, 3) == 1
     assert index_of_max(values, 4) == 3

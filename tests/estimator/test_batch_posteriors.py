@@ -80,6 +80,6 @@ def test_several_sensors(records):
         ),
     ],
 )
-def test_what_is_no_record_is_refused(call, message, records):
+def test_invalid_records_are_refused(call, message, records):
     with pytest.raises(ValueError, match=re.escape(message)):
         call(records[0])

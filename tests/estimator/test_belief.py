@@ -41,10 +41,10 @@ def fixed(index):
     return belief(cov=cov)
 
 
-def test_it_is_told_on_one_line():
+def test_the_repr_is_one_line():
     damping, cubic = np.sqrt(np.diag(covariance())[3:])
-    told = f"stiffness = 1.8e+05 ± 0, damping = 42 ± {damping:.2g}, cubic = 7e+05 ± {cubic:.2g}"
-    assert repr(fixed(2)) == f"Belief(oscillator: {told})"
+    text = f"stiffness = 1.8e+05 ± 0, damping = 42 ± {damping:.2g}, cubic = 7e+05 ± {cubic:.2g}"
+    assert repr(fixed(2)) == f"Belief(oscillator: {text})"
 
 
 def test_parts_and_moments():

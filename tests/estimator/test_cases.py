@@ -1,4 +1,4 @@
-"""Records as people have them are right, or named for the right reason; and the manual says which is which."""
+"""Records of instruments are identified, or their fault is named; the manual has the answer to each."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,12 +7,12 @@ import pytest
 from cases import CASES, Case, answered
 from tables import table
 
-#: Kinds that must be answered right, to their first case; tests/research has all of all kinds, twice.
+#: Kinds with a required answer, to their first case; tests/research runs all cases of all kinds, twice.
 ANSWERED = {case.kind: case for case in reversed(CASES) if case.answer == "right" and not case.then}
 
 
 @pytest.mark.parametrize("case", ANSWERED.values(), ids=str)
-def test_a_record_as_people_have_it_is_right_or_named(case, tmp_path):
+def test_a_record_of_an_instrument_is_identified_or_its_fault_is_named(case, tmp_path):
     case.check(tmp_path)
 
 
@@ -23,13 +23,13 @@ def test_a_record_as_people_have_it_is_right_or_named(case, tmp_path):
         (Case("half_sample", {"smoothly": True, "part": 0.75, "samples": 2000}, ""), "spline", -0.75, "right", ""),
     ],
 )
-def test_the_way_of_the_input_that_a_check_advised_is_judged_again(tmp_path, case, interpolation, delay, verdict, name):
+def test_the_interpolation_that_a_check_advised_is_judged_again(tmp_path, case, interpolation, delay, verdict, name):
     made = replace(case.make(), interpolation=interpolation, delay=delay)
     found, result = next(answered(made, tmp_path))
     assert (found, [warning.name for warning in result.warnings][:1]) == (verdict, [name] if name else [])
 
 
-def test_two_amplitudes_of_a_sine_tell_what_one_leaves_open(tmp_path):
+def test_two_amplitudes_of_a_sine_identify_what_one_leaves_open(tmp_path):
     one, other = (Case("settled_sine", {"part": 0.8, "size": size}, "", seed=4).make() for size in (0.3, 0.9))
     both = replace(one, files={"one.csv": one.files["r.csv"], "other.csv": other.files["r.csv"]})
     assert next(answered(one, tmp_path))[1].unidentified == ("m", "a", "b")

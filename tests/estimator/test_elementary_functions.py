@@ -139,6 +139,6 @@ def test_hyperbolic_tangent_over_its_range():
     np.testing.assert_array_equal(_each(3, np.array([800.0, -1e300, 0.0])), [1.0, -1.0, 0.0])
 
 
-def test_what_is_no_number_stays_none():
+def test_nan_stays_nan():
     for kind in range(4):
         assert np.isnan(_each(kind, np.array([np.nan]))).all()

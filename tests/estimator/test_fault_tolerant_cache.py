@@ -235,7 +235,7 @@ class Timer:
         pass
 
 
-def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
+def test_a_long_compilation_is_announced_once(place, monkeypatch, capsys):
     monkeypatch.setattr(Timer, "asked", [])
     watching = fault_tolerant_cache.CompilationNotice(now=itertools.count(0.0, 1.5).__next__, timer=Timer)
     event.register("numba:compile", watching)
@@ -251,7 +251,7 @@ def test_what_takes_long_says_so_once(place, monkeypatch, capsys):
     assert len(line) <= 80
 
 
-def test_what_took_longer_than_the_timer_could_say_is_said_of_the_next(place, monkeypatch):
+def test_a_compilation_longer_than_a_late_timer_is_announced_with_the_next(place, monkeypatch):
     """A timer that is late, as on a busy machine."""
     monkeypatch.setattr(Timer, "asked", [])
     watching = fault_tolerant_cache.CompilationNotice(now=itertools.count(0.0, 60.0).__next__, timer=Timer)
@@ -275,7 +275,7 @@ def test_garbage_is_collected_again_after_compilation(place):
         gc.enable()
 
 
-def test_the_garbage_of_others_is_left_to_them():
+def test_garbage_of_a_host_application_is_not_frozen():
     imports = "import gc, estimator.compilation.fault_tolerant_cache, agents.commands"
     text = f"{imports}; print(gc.get_freeze_count(), gc.isenabled())"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)

@@ -78,7 +78,7 @@ def test_an_interrupt_before_the_renaming_leaves_nothing_behind(tmp_path, monkey
 
 
 @table("write", [write_atomically, append_atomically])
-def test_what_is_no_file_is_refused_and_stays(tmp_path, write):
+def test_a_directory_or_device_is_refused_and_stays(tmp_path, write):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "linked").symlink_to("pipe")
@@ -140,7 +140,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_it_is(tmp_path, monkey
 
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     for place in (tmp_path, tmp_path / "new", tmp_path / "on the way" / "new"):
-        with pytest.raises(PermissionError) as told:
+        with pytest.raises(PermissionError) as raised:
             check_writable(place)
         message = "[Errno 13] Permission denied; allow to write there, or name another place"
-        assert str(told.value) == f"{message}: '{place}'"
+        assert str(raised.value) == f"{message}: '{place}'"

@@ -115,7 +115,7 @@ def test_a_series_ends_before_its_first_nan():
     assert not fisher_information(PAPER, TWIN, u[:, :0], Q, R).any()
 
 
-def test_bounds():
+def test_cramer_rao_bounds():
     rng = np.random.default_rng(5)
     F = fisher_information(PAPER, TWIN, rng.choice([-0.12, 0.12], 200), Q, R)
     precision = np.linalg.inv(silverbox_prior(PAPER).coefficients_cov)

@@ -22,7 +22,7 @@ GUESS = {name: (0.7 * value, 1.4 * value) for name, value in BENCH[0].items()}
 
 @pytest.fixture(scope="module")
 def bench():
-    """What is found of `BENCH`, by itself and with a guess."""
+    """The results for `BENCH` without and with a guess."""
     return {guessed: identify(rig_of(BENCH, guess=GUESS if guessed else None), simulated(BENCH)) for guessed in (0, 1)}
 
 
@@ -38,7 +38,7 @@ def test_nothing_but_a_record_and_a_step_is_needed(case, kind, bench):
     assert (low, high) == pytest.approx((mean - 1.645 * std, mean + 1.645 * std), rel=1e-3)
 
 
-def test_a_guess_changes_nothing_that_the_record_tells(bench):
+def test_a_guess_changes_no_parameter_that_the_record_determines(bench):
     guessed, alone = bench[True], bench[False]
     for name in BENCH[0]:  # the guess's own pull is a thousandth of a standard deviation
         mean, std = alone.parameters[name]
@@ -90,15 +90,15 @@ def test_gaps_clipped_samples_and_several_records():
 )
 def test_records_may_begin_in_any_motion(kind, delay):
     u, y = simulated(SOFT, samples=4096, kind=kind)
-    told = np.roll(u, -delay)  # recorded so many samples before it acts
-    pieces = [(told[k : k + 280], y[k : k + 280]) for k in np.arange(200, 3800, 300)]
+    recorded = np.roll(u, -delay)  # recorded so many samples before it acts
+    pieces = [(recorded[k : k + 280], y[k : k + 280]) for k in np.arange(200, 3800, 300)]
     result = identify(rig_of(SOFT, kind, delay=delay), pieces)
     assert np.abs(deviations(result, SOFT[0])).max() < 4.5
     assert all(std < 0.02 * abs(SOFT[0][name]) for name, (_, std) in list(result.parameters.items())[:4])
     assert result.warnings == ()
 
 
-def test_what_few_samples_tell_is_a_covariance_in_spite_of_rounding():
+def test_few_samples_give_a_symmetric_covariance_in_spite_of_rounding():
     """Two offsets that show as one leave a covariance that is symmetric to nine digits."""
     u, y = simulated(SOFT)
     rig = rig_of(SOFT)
@@ -153,13 +153,13 @@ def test_the_result_goes_on(tmp_path, bench):
     forecast = result.forecasts[0]
     inside = np.abs(y - forecast[:, 0])[5:] < 1.645 * np.sqrt(forecast[5:, 1])
     assert 0.87 < inside.mean() < 0.93
-    counts, told = zip(*result.history, strict=True)
+    counts, parameters = zip(*result.history, strict=True)
     assert counts == tuple(count - MAX_UNSTATED_DELAY for count in (64, 128, 256, 512, 1024, 2048))
-    assert told[-1] == result.parameters
+    assert parameters[-1] == result.parameters
     for name in BENCH[0]:
-        stds = np.array([one[name][1] for one in told])
+        stds = np.array([one[name][1] for one in parameters])
         assert (stds[1:] < stds[:-1]).all()
-        away = np.array([one[name][0] for one in told]) - BENCH[0][name]
+        away = np.array([one[name][0] for one in parameters]) - BENCH[0][name]
         assert (np.abs(away) < 4.5 * stds).all()
     before = result.parameters["m"][1]
     estimator = result.estimator
@@ -187,8 +187,8 @@ def test_a_sensor_far_off_the_oscillator_changes_nothing_but_its_offset(offset, 
     mean, std = near.parameters["y0"]
     assert far.parameters["y0"] == pytest.approx((mean + offset, std), abs=0.2 * std)
     assert far.warnings == ()
-    told = [found["y0"][0] for _, found in far.history]
-    assert told == pytest.approx([offset] * len(told), abs=2e-4)
+    offsets = [found["y0"][0] for _, found in far.history]
+    assert offsets == pytest.approx([offset] * len(offsets), abs=2e-4)
     for forecast, beside in zip(far.forecasts, near.forecasts, strict=True):
         seen = np.isfinite(beside[:, 0])
         assert np.abs(forecast - beside - [offset, 0.0])[seen, 0].max() < 1e-6
@@ -203,7 +203,7 @@ def test_one_well_of_two_is_found_where_the_output_never_comes_near_zero():
     assert result.warnings == ()
 
 
-def test_noise_of_the_sensor_is_not_told_to_be_a_disturbance():
+def test_sensor_noise_is_not_reported_as_a_disturbance():
     u, y = simulated(BENCH, force=0.0)
     hidden = y + y.std() * np.random.default_rng(1).standard_normal(len(y))
     result = identify(rig_of(BENCH), (u, hidden))
@@ -293,7 +293,7 @@ def test_a_settled_sine_leaves_mass_and_stiffness_open_and_gives_the_damping(amp
     assert spread > 0.1 * abs(believed)
 
 
-def test_two_amplitudes_tell_all_though_their_noises_differ():
+def test_two_amplitudes_identify_all_parameters_though_their_noises_differ():
     records = [settled(amplitude, 9.5, seed) for seed, amplitude in enumerate((0.5, 1.5))]
     result = identify(Rig(1e-3, input=Channel("N"), output=Channel("m")), records)
     assert result.warnings == ()

@@ -49,7 +49,7 @@ def at(pieces, tau):
     return sum(pieces[:, n] * tau**n for n in range(pieces.shape[1]))
 
 
-def test_look_ahead_is_the_quintic_through_its_window():
+def test_lookahead_is_the_quintic_through_its_window():
     way = input_stencil(duffing(), Rig.silverbox("look_ahead"))
     assert (way.lookahead, way.n_past, way.stencil.shape) == (True, 9, (6, 10))
     found = rows(duffing(), Rig.silverbox("look_ahead"), U)  # the t-th is on the way to sample t - 1
@@ -64,7 +64,7 @@ def test_look_ahead_is_the_quintic_through_its_window():
 
 
 @table("delay", [0, 1])
-def test_spline_is_that_through_all_inputs(delay):
+def test_the_spline_goes_through_all_inputs(delay):
     found = rows(duffing(), Rig.silverbox("spline", delay), U)
     spline = make_interp_spline(np.arange(40), U, k=5)
     for t in range(1 + delay, 40):

@@ -71,7 +71,7 @@ def test_terms_are_products_of_whole_powers(term, words):
         difference((Term(1), term))
 
 
-def test_any_power_is_what_it_says():
+def test_powers_equal_pythons_powers():
     powers = ["0.5", "1.5", "(-1/2)", "2.0", "9", "(-3)", "0.3", "loss", "(loss - 1)"]
     x, loss, names = 1.7, 0.4, [f"c{i}" for i in range(len(powers))]
     terms = " + ".join(f"{name}*(exp(log(x)))**{power}" for name, power in zip(names, powers, strict=True))
@@ -120,7 +120,7 @@ def test_the_information_of_powers_is_that_of_differences():
 
 
 @table("magnitude", ["abs({})", "sqrt({}**2)"])
-def test_a_magnitude_is_what_numpy_says(magnitude):
+def test_a_magnitude_equals_numpys(magnitude):
     """Of a number on either side of 0, at it, and of what SymPy does not know to be real."""
     moves = f"u + loss*{magnitude.format('x')} + {magnitude.format('log(loss)')}"
     model = Model(**{**TANK, "rates": (), "next_state": (moves,)})

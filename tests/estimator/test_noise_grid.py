@@ -121,7 +121,7 @@ def test_a_hypothesis_comes_back_when_it_is_true_again():
     assert weights.sum() == pytest.approx(1)
 
 
-def test_nothing_left_is_not_finite():
+def test_a_grid_without_finite_members_is_not_finite():
     free_energies, forecasts = np.zeros(1), np.zeros(2)
     take(np.full(2, 0.5), np.full((2, 1), np.nan), np.ones((2, 2)), free_energies, forecasts)
     assert not np.isfinite(free_energies).any()
@@ -211,7 +211,7 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
         assert (of_one[~kept] == 0).all()
 
 
-def test_a_mixture_of_no_finite_member_is_nothing():
+def test_a_mixture_without_finite_members_is_nan():
     records = np.full((2, 6 + 21 + 4), np.nan)
     assert np.isnan(compile_mixture(6).mixture(pack_into_lanes(records, LANES), np.full(2, 0.5))[1]).all()
 
@@ -291,7 +291,7 @@ def test_predictions_and_free_runs_are_those_of_the_mean(samples, model):
         np.testing.assert_allclose(estimator.predict(u, y), alone.predict(u, y), atol=1e-9)
 
 
-def test_a_member_that_overflowed_has_no_say(samples):
+def test_an_overflowed_member_has_no_weight(samples):
     estimator = ensemble("look-ahead")
     estimator.run(*samples)
     arrays = estimator.arrays()
@@ -309,10 +309,10 @@ def noisy(process_noise, measurement_noise, samples):
     return record(samples, process_noise, measurement_noise)
 
 
-# --- Whether it is right -------------------------------------------------------------------------------------------
+# --- Calibration ---------------------------------------------------------------------------------------------------
 
 
-def test_alone_the_difference_of_the_precisions_hardly_moves():
+def test_a_single_filter_keeps_the_difference_of_the_precisions():
     """A single filter keeps the difference E[γ] - E[ξ] of its priors (module docstring)."""
     prior = silverbox_prior(process_noise=2e-3 / 3, measurement_noise=1e-3 / 3)
     estimator = OnlineEstimator(None, prior)
@@ -337,7 +337,7 @@ def test_both_noises_are_found_within_a_factor_of_three(noises, centers):
     assert 1 / 3 < belief.xi_mean * noises[1] ** 2 < 3
 
 
-def test_where_one_noise_hides_the_other_it_says_so():
+def test_a_noise_hidden_by_the_other_has_a_wide_interval():
     estimator = OnlineEstimator(noise_hypotheses=9)
     first = estimator.noise_ratio
     assert first.std == pytest.approx(first.prior_std)

@@ -137,7 +137,7 @@ def test_nothing_is_learned_from_a_gap(kind, samples):
 
 
 @table("kind", KINDS)
-def test_asking_changes_nothing(kind, samples):
+def test_reading_the_belief_changes_nothing(kind, samples):
     u, y = samples
     asked, untouched = KINDS[kind](), KINDS[kind]()
     for estimator in (asked, untouched):
@@ -345,7 +345,7 @@ def test_two_sensors():
         (np.ma.masked, 0.1, "u must not be a masked array, whose hidden values would be used; pass u.filled(np.nan)"),
     ],
 )
-def test_what_is_no_sample_is_refused(samples, factorisation, u, y, message):
+def test_invalid_samples_are_refused(samples, factorisation, u, y, message):
     estimator, untouched = (OnlineEstimator(factorisation=factorisation) for _ in range(2))
     with pytest.raises(ValueError, match=re.escape(message)):
         estimator.update(u, y)

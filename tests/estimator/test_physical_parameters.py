@@ -156,7 +156,7 @@ def test_a_model_without_parameters_has_its_coefficients():
 
 
 @table("step", [0.0, -1.0, np.inf, np.nan])
-def test_a_step_that_is_none_is_named(step):
+def test_an_invalid_sampling_step_is_named(step):
     message = f"step must be a number from 1e-30 to 1e+30, but is {step}; give the seconds"
     with pytest.raises(ValueError, match=re.escape(message)):
         Scales(step)
@@ -216,7 +216,7 @@ def test_no_parameters_have_no_coefficients():
     assert coefficients_of(PAPER, nothing).shape == (0, 3, 4)
 
 
-def test_an_inverse_that_undoes_nothing_is_refused():
+def test_an_inverse_map_that_does_not_invert_is_refused():
     # At a step of a second nobody would see it.
     heat = Model("heat", **HEAT, dimensions=DIMENSIONS, inverse={"gain": "step/cap", "loss": "cond/cap"})
     coefficients_of(heat, {"cap": 50.0, "cond": 2.0}, Scales(1.0))

@@ -28,7 +28,7 @@ def test_lines_say_the_share_and_the_time_that_is_left(clock, capsys):
     assert capsys.readouterr().err == "Training 25 %, 30 s left: return 4\n"
 
 
-def test_what_is_gone_on_with_is_as_quick_as_what_was_done_of_it(clock, capsys):
+def test_the_remaining_time_assumes_the_speed_so_far(clock, capsys):
     with progress.show_progress("Training") as tell:
         tell(0.5)
         clock["now"] += 10.0

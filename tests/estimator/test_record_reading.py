@@ -1,4 +1,4 @@
-"""Records as users have them: arrays, CSV and MAT files; what is cut, and what is refused."""
+"""Records of users: arrays, CSV and MAT files; cut samples, and refused records."""
 
 import re
 from pathlib import Path
@@ -21,14 +21,14 @@ def read(path, rig):
     return one.u, one.y
 
 
-def test_a_converter_s_levels_are_no_stop():
+def test_converter_levels_are_no_clipping():
     _, y = simulated(BENCH)
     level = np.abs(y).max() / 100
     assert not find_clipped_outputs(level * np.round(y / level)).any()
     assert not find_clipped_outputs(np.concatenate([np.full(100, y.min()), y])).any()
 
 
-def test_a_stop_that_single_samples_meet_is_found():
+def test_clipping_of_single_samples_is_found():
     rng = np.random.default_rng(0)
     y = np.sin(2.2 * np.arange(500)) + 0.01 * rng.standard_normal(500)
     assert np.array_equal(find_clipped_outputs(np.minimum(y, 0.98)), y >= 0.98)
@@ -99,7 +99,7 @@ def test_a_column_that_is_named_in_part_is_proposed():
         choose_columns(Path("r.csv"), ["t", "shaker force [N]", "accel [g]"], 3, "force", None)
 
 
-def test_an_input_in_place_of_the_output_is_asked_about(tmp_path):
+def test_an_input_in_place_of_the_output_is_questioned(tmp_path):
     rng = np.random.default_rng(0)
     held, moving = np.repeat(rng.uniform(-1, 1, 32), 24), np.sin(np.arange(768) / 9) + rng.standard_normal(768)
     rows = "\n".join(f"{a},{b}" for a, b in zip(held, moving, strict=True))
@@ -310,7 +310,7 @@ def test_a_mat_file_is_read_by_nothing_that_lies_beside_it_and_not_for_ever(tmp_
 
 
 def copies(u, y):
-    """What a user may give together by mistake, and from which sample on the second has the samples of the first."""
+    """Records that a user may combine by mistake, and the sample from which the second repeats the first."""
     again = np.concatenate([u, [np.nan], u]), np.concatenate([y, [np.nan], y])
     late = y.copy()
     late[[40, 150]] = np.nan

@@ -1,4 +1,4 @@
-"""Rigs: what describes one, its units and scales, and the prior that its guess makes."""
+"""Rigs: their description, units and scales, and the prior of their guess."""
 
 import json
 import os
@@ -194,14 +194,14 @@ def test_units_of_parameters(input_unit, output_unit, order, units):
 
 
 def test_a_guess_is_the_prior_s_interval():
-    told = rig_prior(BENCH).parameters()
+    parameters = rig_prior(BENCH).parameters()
     for name in "cab":
         low, high = GUESS[name]
-        mean, std, _ = told[name]
+        mean, std, _ = parameters[name]
         # To first order the prior's moments give back those of the guess, as far as m is sharp: it is known to 15 %.
         assert mean == pytest.approx((low + high) / 2, abs=0.1 * (high - low))
         assert std == pytest.approx((high - low) / 2 / 1.645, rel=0.25)
-    assert told["m"][0] == pytest.approx(0.387, abs=0.01)
+    assert parameters["m"][0] == pytest.approx(0.387, abs=0.01)
 
 
 def test_numbers_do_not_depend_on_the_units():
@@ -264,7 +264,7 @@ def test_the_instrument_comes_from_the_file_that_the_rig_comes_from(tmp_path, mo
         ("input", {"limits": 3}, "input must have keys of"),
     ],
 )
-def test_an_error_says_of_which_channel(where, channel, message):
+def test_an_error_names_the_channel(where, channel, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Rig.from_dict({"step": 1e-3, where: channel})
 

@@ -162,7 +162,7 @@ def test_what_cannot_be_written_is_refused(place, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_members_that_are_no_belief_together_are_refused():
+def test_members_with_absurd_numbers_are_refused():
     estimator = KINDS["ensemble"]()
     estimator.run(*record(12))
     arrays = estimator.arrays()

@@ -310,6 +310,6 @@ def test_turns_of_short_loops_go_side_by_side(lines, turns):
         (arithmetic.py_func, ("a", "b"), "arithmetic takes numbers, tuples of them and flat arrays, but is given"),
     ],
 )
-def test_what_is_not_straight_is_refused(function, arguments, said):
+def test_unsupported_constructs_are_refused(function, arguments, said):
     with pytest.raises(Exception, match=re.escape(said)):
         scalar_jit(function)(*arguments)

@@ -76,7 +76,7 @@ def sum_and_product(a, b):
     return a + b, a * b
 
 
-def test_one_lane_is_touched_or_none():
+def test_lane_functions_change_one_lane_or_none():
     W = block()
     before = W.reshape(-1, LANES).copy()
     a, b = before[:2]

@@ -1,4 +1,4 @@
-"""What `identify` warns of: each check names its fault. benchmarks/rigs says how often, and that good records pass."""
+"""Warnings of `identify`: each check names its fault. benchmarks/rigs measures detection and false alarms."""
 
 import re
 import sys
@@ -56,10 +56,10 @@ def test_a_large_delay_is_found_step_by_step(late):
     for _ in range(6):
         warnings = identify(rig_of(BENCH, delay=delay), (u[late:], y[:-late])).warnings
         messages = " ".join(one.message for one in warnings if one.name == "delay")
-        told = re.findall(r"'zero_order' with delay (\d+), by", messages)
-        if not told:
+        delays = re.findall(r"'zero_order' with delay (\d+), by", messages)
+        if not delays:
             break
-        (delay,) = map(int, told)
+        (delay,) = map(int, delays)
     assert (delay, warnings) == (late, ())
 
 
@@ -74,7 +74,7 @@ def test_an_accelerometer_that_is_sampled_after_the_input_switches():
     assert np.abs(deviations(result, BENCH[0])).max() < 4.5
 
 
-def test_a_channel_that_is_turned_round_and_energy_that_flows_in_are_named():
+def test_a_channel_with_reversed_sign_and_negative_damping_are_named():
     u, y = simulated(BENCH)
     for records, guess in (((u, -y), None), ((-u, y), None), ((u, -y), GUESS)):
         result = identify(rig_of(BENCH, guess=guess), records)
@@ -107,13 +107,13 @@ def test_a_guess_that_leads_the_fit_astray_is_named_and_nothing_else(change, sli
 @pytest.mark.parametrize(
     ("channel", "factor"), [("input", 4.45), ("input", 1 / 4.45), ("output", 3), ("output", 1 / 3)]
 )
-def test_a_wrong_scale_is_told_from_a_wrong_step(channel, factor):
+def test_a_wrong_scale_is_distinguished_from_a_wrong_step(channel, factor):
     u, y = simulated(BENCH, samples=1024)
     records = (u / factor, y) if channel == "input" else (u, y / factor)
     (warning,) = identify(rig_of(BENCH, guess=GUESS), records).warnings
     assert warning.name == "guess"
-    told = re.findall(rf"if the {channel} were about (\S+) times as large as recorded", warning.message)
-    assert [float(one) for one in told] == pytest.approx([factor], rel=0.1)
+    factors = re.findall(rf"if the {channel} were about (\S+) times as large as recorded", warning.message)
+    assert [float(one) for one in factors] == pytest.approx([factor], rel=0.1)
 
 
 @pytest.mark.parametrize("kind", ["velocity", "acceleration"])
@@ -122,8 +122,8 @@ def test_a_wrong_step_is_named_whatever_the_sensor_shows(kind, factor):
     u, y = simulated(BENCH, samples=1024, kind=kind)
     wrong = replace(rig_of(BENCH, kind, guess=GUESS), step=factor * BENCH[1])
     (message,) = (one.message for one in identify(wrong, (u, y)).warnings if one.name == "step")
-    told = re.findall(r"if the sampling step were about (\S+) times the rig's", message)
-    assert [float(one) for one in told] == pytest.approx([1 / factor], rel=0.15)
+    factors = re.findall(r"if the sampling step were about (\S+) times the rig's", message)
+    assert [float(one) for one in factors] == pytest.approx([1 / factor], rel=0.15)
 
 
 @pytest.mark.parametrize(("kind", "noise"), [("displacement", 0.0), ("velocity", 1e-7)])
@@ -144,7 +144,7 @@ def test_a_record_without_noise_is_judged_by_no_check(kind, noise):
     assert [result.parameters[name][0] for name in "mcab"] == pytest.approx([m, c, a, b], rel=1e-5)
 
 
-def test_a_guess_that_is_right_is_not_blamed_for_a_wrong_limit():
+def test_a_correct_guess_is_not_blamed_for_a_wrong_limit():
     u, y = simulated(BENCH)
     source, sink = Channel("N", limit=0.012), Channel("m", range=1e-5)
     warnings = identify(Rig(BENCH[1], input=source, output=sink, guess=GUESS), (u, y)).warnings
@@ -161,9 +161,9 @@ def test_a_wrong_step_and_a_parameter_that_does_nothing_are_named():
     weak = (BENCH[0], BENCH[1], 0.05, 5e-6, 8)
     for known in (None, GUESS):
         warnings = identify(rig_of(weak, guess=known), simulated(weak)).warnings
-        told = [warning.message for warning in warnings if warning.name == "not_identified"]
-        assert [message.split(":")[0] for message in told] == ["b"]
-        assert "the spring is linear to" in told[0]
+        messages = [warning.message for warning in warnings if warning.name == "not_identified"]
+        assert [message.split(":")[0] for message in messages] == ["b"]
+        assert "the spring is linear to" in messages[0]
 
 
 def test_a_bench_s_own_disturbance_is_no_fault_of_a_weak_input():

@@ -184,7 +184,7 @@ class Step(NamedTuple):
     Attributes:
         moved: (n,) states after it.
         jacobian: (m, m) of states and coefficients after it, by those before.
-        noise: (n, n) covariance that unit process noise brings.
+        noise: (n, n) covariance that unit process noise adds.
     """
 
     moved: np.ndarray
@@ -241,7 +241,7 @@ def predicted(cov: np.ndarray, step: Step, q: float) -> np.ndarray:
 
 
 class Seen(NamedTuple):
-    """What an output brings.
+    """The update by an output.
 
     Attributes:
         gain: (m,) by which the innovation moves the mean.
@@ -275,7 +275,7 @@ class Walk:
         loss: minus the log likelihood, without the constant; 0 where outputs are not followed.
         gradient: (K,) its slope, the gains held.
         information: (K, K) Fisher's, of independent sensors, the gains held.
-        shown: (T, sensors) what the sensors are expected to show.
+        shown: (T, sensors) expected outputs of the sensors.
         innovations, variances: (T, sensors); innovations are 0 where outputs are not followed.
         state, cov, sensitivity: at the end.
         growth: largest factor by which an error of the state has grown between any two samples.

@@ -24,7 +24,7 @@ class Belief:
 
 @dataclass
 class Outcome:
-    """What an update leaves.
+    """The result of an update.
 
     Attributes:
         belief: after it.
@@ -58,7 +58,7 @@ def cubature(plant: Plant, n: int, belief: Belief, inputs: Sequence[float], move
         if given > 1e-12 * sub[-1, -1]:
             unknown = trial
     factor = np.linalg.cholesky(cov[np.ix_(unknown, unknown)])
-    along = np.sqrt(len(unknown)) * np.linalg.solve(factor, cov[unknown]).T  # how all quantities go along with them
+    along = np.sqrt(len(unknown)) * np.linalg.solve(factor, cov[unknown]).T  # regression of all quantities on them
     points = belief.mean[:, None] + np.hstack([along, -along])
     images = points.copy()
     images[:n] = moved(plant, points[:n], points[n:], inputs)
@@ -141,7 +141,7 @@ def _told(
 ) -> Outcome:
     """Update of a predicted belief by outputs; ``mean`` and ``cov`` are without process noise.
 
-    Sensor by sensor; q(γ) is told by the first that shows process noise, all of whose variance N comes with it.
+    The update goes sensor by sensor. The first sensor that shows process noise informs q(γ), with the whole variance N.
     """
     gamma, xi = belief.gamma, list(belief.xi)
     readouts = jacobian(shows, mean)
@@ -195,7 +195,7 @@ def free_energy(e, s, q, r, gamma, xi, with_process) -> float:
     """
 
     def part(v, prior):
-        """What changes where log v becomes E[-log precision] and 1/v its mean, and the Gamma's divergence."""
+        """The terms that change where log v becomes E[-log precision] and 1/v its mean, and the Gamma's divergence."""
         shape0, rate0 = prior
         power = (v * e / S) ** 2 + v - v**2 / S
         shape, rate = shape0 + 0.5, rate0 + 0.5 * power

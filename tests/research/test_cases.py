@@ -1,4 +1,4 @@
-"""All records as people have them, of which `make test` runs one of each kind that must be answered."""
+"""All records of instruments; `make test` runs one of each kind with a required answer."""
 
 from dataclasses import replace
 
@@ -8,5 +8,5 @@ from cases import CASES
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_record_as_people_have_it_is_right_or_named(case, seed, tmp_path):
+def test_a_record_of_an_instrument_is_identified_or_its_fault_is_named(case, seed, tmp_path):
     replace(case, seed=seed).check(tmp_path)

@@ -21,7 +21,7 @@ def test_the_programme_is_the_plain_recursion(energies):
     grid = StateGrid(np.array([1.5, -1.3, -0.94, 0.35]), 0.6, 0.15, 5, 3, 5, energy, energies)
     rng = np.random.default_rng(0)
     costs = rng.normal(size=(5, 5, 3, 3, 7))
-    costs += costs[::-1, ::-1, ::-1, ::-1, [4, 3, 2, 1, 0, 6, 5]]  # the same where all is turned over
+    costs += costs[::-1, ::-1, ::-1, ::-1, [4, 3, 2, 1, 0, 6, 5]]  # the same after a change of all signs
     x, even = np.linspace(-0.6, 0.6, 5), np.linspace(-1.0, 1.0, 5)
     held = 0.15 * (even * np.abs(even) if energies > 1 else even)
     nodes, roots = held[[0, 2, 4]], np.linspace(0.0, 1.0, energies)
@@ -36,7 +36,9 @@ def test_the_programme_is_the_plain_recursion(energies):
                 left = 1.0 if energies == 1 else roots[k] ** 2 - u**2 / energy
                 if abs(u) > 0.15 * (1 + 1e-12) or abs(free + 0.35 * u) > 0.6 * (1 + 1e-12) or left < -1e-12:
                     continue
-                lines = np.array([[told(nodes, after[p, i, :, a, e], u) for e in range(energies)] for p in range(5)])
+                lines = np.array(
+                    [[interpolated(nodes, after[p, i, :, a, e], u) for e in range(energies)] for p in range(5)]
+                )
                 alive = np.isfinite(after[:, i, 0, 0, 0])
                 line = np.array([between(x, lines[:, e], free + 0.35 * u, alive) for e in range(energies)])
                 later[m] = line[0] if energies == 1 else spent(roots, line, np.sqrt(max(left, 0.0)))
@@ -49,13 +51,13 @@ def test_the_programme_is_the_plain_recursion(energies):
     assert np.isfinite(after).any()
 
 
-def told(nodes, values, u):
-    """Along the inputs, through three levels; whether a node is dead does not depend on them."""
+def interpolated(nodes, values, u):
+    """Interpolation along the inputs, through three levels; whether a node is dead does not depend on the inputs."""
     return np.polyval(np.polyfit(nodes, values, 2), u) if np.isfinite(values).all() else -np.inf
 
 
 def between(x, line, where, alive):
-    """Through four nodes where all are alive with whatever energy, else two; of two, a dead one does not count."""
+    """Interpolation through four nodes where all are alive at every energy, else two; of two a dead one is left out."""
     k = min(int(np.floor((where - x[0]) / (x[1] - x[0]) + 1e-9)), len(x) - 2)
     share = min(max((where - x[k]) / (x[1] - x[0]), 0.0), 1.0)
     down, up = line[k], line[k + 1]
@@ -69,7 +71,7 @@ def between(x, line, where, alive):
 
 
 def spent(roots, line, root):
-    """Along the energies that are left, by their roots: through four nodes where they are alive, else two."""
+    """Interpolation along the roots of the energies left: through four nodes where they are alive, else two."""
     low = min(int(root * (len(roots) - 1) + 1e-9), len(roots) - 2)
     first = min(max(low - 1, 0), len(roots) - 4)
     if np.isfinite(line[first]):
@@ -81,7 +83,7 @@ def spent(roots, line, root):
 
 
 def highest(values, held, limited):
-    """The largest, or where energy is limited the top of the parabola through it and its neighbours."""
+    """The largest value; under an energy limit the maximum of the parabola through it and its neighbours."""
     m = int(values.argmax())
     if limited and 0 < m < len(held) - 1 and np.isfinite(values[m - 1 : m + 2]).all():
         parabola = np.polyfit(held[m - 1 : m + 2] - held[m], values[m - 1 : m + 2], 2)
@@ -95,12 +97,14 @@ def test_no_matrix_is_below_the_information():
     rng = np.random.default_rng(0)
     u = rng.uniform(-0.15, 0.15, 48)
     C, N, M = certificate.moments(u)
-    told = certificate.units.T @ systems.information(u[None])[0] @ certificate.units
+    information = certificate.units.T @ systems.information(u[None])[0] @ certificate.units
     for W in (np.linalg.solve(M, N), 0.01 * rng.normal(size=N.shape), np.zeros(N.shape)):
-        above = C - W.T @ N - N.T @ W + W.T @ M @ W - told
-        assert np.linalg.eigvalsh(above).min() > -2e-3 * np.linalg.norm(told)  # F takes the filter as if at its limit
+        above = C - W.T @ N - N.T @ W + W.T @ M @ W - information
+        assert np.linalg.eigvalsh(above).min() > -2e-3 * np.linalg.norm(
+            information
+        )  # F takes the filter as if at its limit
     W = np.linalg.solve(M, N)
-    assert np.linalg.slogdet(np.eye(4) + C - N.T @ W)[1] < np.linalg.slogdet(np.eye(4) + told)[1] + 1.0
+    assert np.linalg.slogdet(np.eye(4) + C - N.T @ W)[1] < np.linalg.slogdet(np.eye(4) + information)[1] + 1.0
 
 
 def test_it_is_above_every_input_of_a_tiny_problem():
@@ -182,6 +186,6 @@ def test_it_is_above_the_oracle_where_energy_is_limited_and_not_far():
     assert np.abs(x).max() <= 0.6
 
 
-def test_other_equations_have_none_yet():
+def test_other_equations_have_no_certificate():
     with pytest.raises(ValueError, match=r"must obey Eq. \(2\)"):
         Certificate(TrackSystems.of("duffing_env/Power-v1", 1), 0)

@@ -1,4 +1,4 @@
-"""The linear programme of a polishing, against SciPy's, which is solved from nothing and has dense matrices."""
+"""The linear programme of a refinement, against SciPy's, which has a cold start and dense matrices."""
 
 import sys
 
@@ -14,7 +14,7 @@ SAMPLES, STATES, RADIUS = 12, 2, 0.05
 
 
 def line(rng):
-    """Inputs, a gradient, what is shown, and slopes of a system that is damped."""
+    """Inputs, a gradient, outputs, and Jacobians of a damped system."""
     slopes = rng.normal(size=(SAMPLES, STATES + 1, STATES + 3)) * 0.4
     return rng.uniform(-0.1, 0.1, SAMPLES), rng.normal(size=SAMPLES), rng.uniform(-0.51, 0.51, SAMPLES), slopes
 
@@ -53,10 +53,10 @@ def test_the_change_is_the_best_one_each_time(energy, shown):
         held += np.isclose(np.abs(given[2] + G @ delta), limits.soft_limit).sum()
         if shown == 0:
             np.testing.assert_allclose(states[1:, 0], (G @ delta)[:-1], atol=1e-9)
-    assert held  # the limit is felt
+    assert held  # the limit is active
 
 
-def test_what_no_small_change_leads_within_the_limits_has_no_solution_and_the_next_has():
+def test_an_infeasible_programme_has_no_solution_and_the_next_one_has():
     rng = np.random.default_rng(1)
     limits = DesignLimits(0.52, 0.51, 0.1, np.inf)
     programme = LinearProgramme(SAMPLES, STATES, 0, limits)

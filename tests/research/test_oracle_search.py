@@ -1,4 +1,4 @@
-"""The oracle's search: its limits, its summits, and what the command stores."""
+"""The oracle's search: its limits, its local maxima, and the inputs that the command stores."""
 
 import re
 
@@ -51,7 +51,7 @@ def test_the_search_keeps_the_limits_and_beats_a_random_signal():
         ({"seed": -1}, "seed must be a whole number from 0"),
     ],
 )
-def test_searches_of_nothing_are_refused(options, message):
+def test_empty_searches_are_refused(options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Config(**options)
 
@@ -62,7 +62,9 @@ def test_the_search_goes_on_until_three_starts_agree(same, tried, monkeypatch):
     found = []
     monkeypatch.setattr(oracle_search, "_AGREEMENT", same)
     monkeypatch.setattr(
-        oracle_search, "refine_input", lambda *given, **told: found.append(refine_input(*given, **told)) or found[-1]
+        oracle_search,
+        "refine_input",
+        lambda *given, **options: found.append(refine_input(*given, **options)) or found[-1],
     )
     short = TrackSystems.of(SHORT, 1, {"horizon": 32})
     _, value, apart = search_best_input(short, 0, np.empty((0, 32)), np.random.default_rng(0), 6)
@@ -80,7 +82,7 @@ def test_fewer_than_three_starts_do_not_agree(monkeypatch):
 
 
 @pytest.mark.slow  # the search is seconds of compilation
-def test_what_blows_up_is_not_polished():
+def test_a_diverging_input_is_not_refined():
     systems = TrackSystems.of(SHORT, 1)
     limits = systems.limits._replace(output=50.0, soft_limit=50.0, amplitude=5.0)
     _, value = refine_input(
@@ -95,7 +97,7 @@ def test_under_a_budget_the_search_spends_it_in_a_burst():
     u, value, _ = search_best_input(systems, 0, np.empty((0, 256)), np.random.default_rng(0), 2)
     energy = (u**2).sum() / systems.limits.energy
     assert 0.99 < energy <= 1
-    # Spread evenly over the episode, the same energy tells 3 nats less.
+    # Spread evenly over the episode, the same energy gives 3 nats less.
     square = 0.0222 * np.sign(np.sin(2 * np.pi * 68 / 610.35 * np.arange(256) + 0.1))
     assert value > systems.criterion_and_peak(square[None])[0][0] + 3.0
 
@@ -119,7 +121,7 @@ def test_the_search_serves_the_differential_equation_too(options, empty_folder):
 
 
 @pytest.mark.slow  # the search is seconds of compilation
-def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys):
+def test_the_command_stores_only_better_inputs(empty_folder, capsys):
     systems = TrackSystems.of(SHORT, 2)
     with pytest.raises(FileNotFoundError, match="no oracle is stored"):
         Oracle.of(systems)
@@ -151,7 +153,7 @@ def test_the_command_stores_what_is_better_and_nothing_else(empty_folder, capsys
 
 
 @pytest.mark.slow  # as above
-def test_polishing_ends_at_a_summit_within_the_limits():
+def test_refinement_ends_at_a_local_maximum_within_the_limits():
     systems = TrackSystems.of(SHORT, 1)
     model, limits = systems.plant.model, systems.limits
     sizes = probe_time_scales(ModelView(model), systems.theta[0], limits.amplitude, limits.output).scales
@@ -170,7 +172,7 @@ def test_polishing_ends_at_a_summit_within_the_limits():
 
 
 @pytest.mark.slow  # as above
-def test_what_does_not_come_near_its_goal_is_given_up(monkeypatch):
+def test_a_search_far_from_its_target_is_abandoned(monkeypatch):
     systems = TrackSystems.of(SHORT, 1)
     model, limits = systems.plant.model, systems.limits
     sizes = probe_time_scales(ModelView(model), systems.theta[0], limits.amplitude, limits.output).scales

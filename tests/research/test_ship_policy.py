@@ -1,4 +1,4 @@
-"""Shipping: the median seed goes out, with a card that tells of all."""
+"""Shipping: the median seed ships, with a card that has the scores of all seeds."""
 
 import json
 import shutil
@@ -77,7 +77,7 @@ def test_a_single_seed_ships_as_one(runs, shelf):
     assert "seeds" not in card["scores"]["information_gain"]
 
 
-def test_what_is_no_recipe_does_not_ship(runs, shelf, tmp_path):
+def test_runs_of_different_recipes_do_not_ship(runs, shelf, tmp_path):
     other = changed(runs[1], tmp_path / "other", reward="fisher")
     with pytest.raises(ValueError, match=r"one recipe, but .*other has another reward"):
         ship_median(Config("ppo/short", (runs[0], other)))
@@ -107,7 +107,7 @@ def test_the_median_of_an_even_number_is_the_lower_one():
     assert median_index([4.0, 1.0, 3.0, 2.0]) == 3
 
 
-def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
+def test_no_shipped_card_names_a_machine(tmp_path, runs):
     for card in policies.TRAINED.glob(f"*/*/{CARD_FILE}"):
         assert '"/' not in card.read_text(), card
     run = shutil.copytree(runs[0], tmp_path / "mine")
@@ -120,7 +120,7 @@ def test_no_card_that_ships_tells_of_a_machine(tmp_path, runs):
 
 
 @pytest.mark.parametrize("name", policies.trained_policies())
-def test_a_policy_that_ships_does_what_its_card_says(name):
+def test_a_shipped_policy_scores_as_its_card_says(name):
     card = make_policy(name).card
     if card["config"]["env"] == FAMILY:
         gains = np.array([play_episode(member, name, i)[0] for i, member in enumerate(draw_unseen_rigs(8))])
@@ -128,10 +128,10 @@ def test_a_policy_that_ships_does_what_its_card_says(name):
         assert abs(gains.mean() - expected) < 4 * gains.std() / np.sqrt(8)
         return
     (evaluation,) = evaluate_policies([name], card["config"]["env"], systems=16)
-    # Of several training seeds the card tells all, and which of them ships.
+    # With several training seeds the card has the scores of all, and names the one that ships.
     place = card["seeds"].index(card["shipped"]["seed"])
     for metric, slack in (("information_gain", 0.05), ("coverage", 0.02)):
         values = evaluation.metrics[metric]
-        told = card["scores"][metric]
-        expected = told["seeds"][place] if "seeds" in told else told["mean"]
+        scores = card["scores"][metric]
+        expected = scores["seeds"][place] if "seeds" in scores else scores["mean"]
         assert abs(values.mean() - expected) < 4 * values.std() / np.sqrt(16) + slack

@@ -59,14 +59,14 @@ def test_policies_are_judged_beside_the_planner():
 
 
 @pytest.mark.parametrize("cases", [(9,), (0,), ()])
-def test_cases_that_are_none_are_refused(cases):
+def test_unknown_cases_are_refused(cases):
     with pytest.raises(ValueError, match=r"cases must be of \[1, 2, 3, 4\], but are \["):
         changed_options.Config(cases=cases)
     with pytest.raises(ValueError, match=r"versions must be of \[0, 1\], but are \[2\]"):
         changed_options.Config(versions=(2,))
 
 
-def test_an_algorithm_as_it_comes_is_trained_and_saved(tmp_path, monkeypatch):
+def test_an_algorithm_with_its_defaults_is_trained_and_saved(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sb3_baselines.main(sb3_baselines.Config("ppo", steps=100))
     policy = make_policy("runs/sb3-ppo-short-v0-0")

@@ -34,18 +34,18 @@ from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 
 class Bench(SimulatedPlant):
-    """A simulated plant that remembers what it was told, and can be made to fail."""
+    """A simulated plant that records its calls, and can be made to fail."""
 
     def __init__(self, **options):
         super().__init__(RIG, TRUTH, **{"clock": JumpingClock(), **options})
-        self.told, self.reads, self.fault = [], 0, None
+        self.calls, self.reads, self.fault = [], 0, None
 
     def arm(self, watchdog):
-        self.told.append(("arm", watchdog))
+        self.calls.append(("arm", watchdog))
         super().arm(watchdog)
 
     def apply(self, u):
-        self.told.append(("apply", u))
+        self.calls.append(("apply", u))
         return super().apply(u)
 
     def read(self):
@@ -54,7 +54,7 @@ class Bench(SimulatedPlant):
         return value if self.fault is None else self.fault(self.reads, value)
 
     def disarm(self):
-        self.told.append(("disarm",))
+        self.calls.append(("disarm",))
         super().disarm()
 
 
@@ -81,7 +81,7 @@ def events(folder):
 # --- sessions
 
 
-def test_a_session_clamps_and_tells_what_was_applied():
+def test_a_session_clamps_and_returns_the_applied_input():
     plant = Bench()
     with Session(plant, RIG, nothing, 2.0) as session:
         assert session.apply(1.0) == 0.0, "it starts disarmed"
@@ -90,8 +90,8 @@ def test_a_session_clamps_and_tells_what_was_applied():
         assert session.apply(-100.0) == -4.0
         with pytest.raises(ValueError, match="input must be finite"):
             session.apply(math.nan)
-    assert plant.told[1] == ("arm", 2.0)
-    assert plant.told[-1] == ("disarm",)
+    assert plant.calls[1] == ("arm", 2.0)
+    assert plant.calls[-1] == ("disarm",)
     assert plant.applied == 0.0
 
 
@@ -124,14 +124,14 @@ def test_disarming_goes_on_where_zeroing_fails():
 
 @pytest.mark.parametrize("method", ["zero", "disarm"])
 @table("ended", ["zero", "range", "error"])
-def test_an_input_that_could_not_be_zeroed_is_told_loudly(method, ended, tmp_path, capsys):
+def test_an_input_that_could_not_be_zeroed_is_reported_on_stderr(method, ended, tmp_path, capsys):
     plant = Bench()
     plant.fault = lambda k, y: 0.09 if k == 20 and ended == "range" else y
     setattr(plant, method, lambda: 1 / 0)
     plan = RunSettings(policy="prbs", samples=16, no_watchdog=True)
-    told = {"on_progress": lambda samples: {}["a bug"]} if ended == "error" else {}
-    with pytest.raises(KeyError) if told else nullcontext():
-        result = run_experiment(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **told)
+    options = {"on_progress": lambda samples: {}["a bug"]} if ended == "error" else {}
+    with pytest.raises(KeyError) if options else nullcontext():
+        result = run_experiment(RIG, plant, tmp_path / "run", plan, clock=plant.clock, **options)
         assert (result.outcome, result.exit_status) == (ended, 1)
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["how"] == ended
@@ -177,11 +177,11 @@ def test_rigs_that_cannot_be_run(rig, message, tmp_path):
     plant = Bench()
     with pytest.raises(ValueError, match=message):
         play(tmp_path / "run", plant, rig)
-    assert plant.told == []
+    assert plant.calls == []
     assert not (tmp_path / "run").exists()
 
 
-# --- what is believed, and what a policy sees of it
+# --- the belief, and the observation of a policy
 
 
 class Stepped:
@@ -233,7 +233,7 @@ def test_a_missing_output_is_shown_as_what_the_model_expects_of_the_sensor(kind)
     np.testing.assert_array_equal(shown, observed.observation(u, float(expected[kind]), 4))
 
 
-def test_the_belief_ahead_is_that_of_a_sample_nobody_measured():
+def test_the_predicted_belief_equals_an_update_with_a_missing_output():
     follower, reference = RunEstimator(RIG), OnlineEstimator(rig=replace(RIG, delay=-1))
     u, y = np.array([0.0, 1.0, -2.0]), np.array([1e-4, 2e-4, 1e-3])
     follower.update(u, y)
@@ -245,7 +245,7 @@ def test_the_belief_ahead_is_that_of_a_sample_nobody_measured():
     assert ahead == reference.belief
 
 
-def test_a_delay_is_looked_ahead_over():
+def test_a_delay_is_predicted_over():
     rig = replace(RIG, delay=2)
     follower = RunEstimator(rig)
     follower.update([0.0, 1.0], [0.0, 0.0])
@@ -269,7 +269,7 @@ def test_a_pause_forgets_the_phase_and_keeps_the_rest():
 
 
 def two_blocks(follower, plant, seed=0):
-    """What two blocks after a silent one put in and out; the follower has taken them, one by one."""
+    """Inputs and outputs of two blocks after a silent one; the estimator has processed them one by one."""
     rng, played = np.random.default_rng(seed), []
     for size in (0.0, 3.0, 3.0):
         u, y = plant.play(size * np.repeat(rng.choice([-1.0, 1.0], 16), 8))
@@ -279,16 +279,16 @@ def two_blocks(follower, plant, seed=0):
     return played
 
 
-def test_blocks_tell_the_coefficients_together_as_identify_does():
+def test_blocks_together_give_the_coefficients_of_identify():
     follower, plant = RunEstimator(RIG), Bench()
     plant.arm(None)
     played = two_blocks(follower, plant)
-    told, whole = follower.belief, identify(RIG, played).belief
+    belief, whole = follower.belief, identify(RIG, played).belief
     std = np.sqrt(np.diag(whole.coefficients_cov))
     # identify leaves out the first three outputs of each block, in case the input comes later than is thought.
-    np.testing.assert_allclose(told.coefficients_mean / std, whole.coefficients_mean / std, rtol=0.0, atol=0.3)
-    np.testing.assert_allclose(np.sqrt(np.diag(told.coefficients_cov)), std, rtol=0.05)
-    for name, (mean, deviation, _) in told.parameters().items():
+    np.testing.assert_allclose(belief.coefficients_mean / std, whole.coefficients_mean / std, rtol=0.0, atol=0.3)
+    np.testing.assert_allclose(np.sqrt(np.diag(belief.coefficients_cov)), std, rtol=0.05)
+    for name, (mean, deviation, _) in belief.parameters().items():
         assert abs(mean - TRUTH.get(name, 0.0)) < 4 * deviation, name
 
 
@@ -381,7 +381,7 @@ def test_a_belief_that_cannot_be_safe_is_not_played(tmp_path):
     guess = {"m": (0.8, 1.25), "c": (-3.0, 0.5), "a": (-50.0, 180.0), "b": (-1e6, 1e5)}
     result = play(tmp_path / "run", plant, replace(RIG, guess=guess), samples=400)
     assert (result.outcome, result.exit_status) == ("design", 1)
-    assert not any(told[0] == "arm" for told in plant.told)
+    assert not any(call[0] == "arm" for call in plant.calls)
 
 
 @pytest.mark.slow
@@ -436,7 +436,7 @@ def test_the_record_says_what_was_applied_at_which_tick(tmp_path):
     found = rows(tmp_path / "run")
     assert [int(row["sample"]) for row in found] == list(range(29)), "8 silent, 20 inputs, and the last response"
     assert [float(row["u"]) for row in found[:8]] == [0.0] * 8
-    applied = [u for kind, *u in plant.told if kind == "apply"]
+    applied = [u for kind, *u in plant.calls if kind == "apply"]
     assert [[float(row["u"])] for row in found[8:]] == applied
     assert float(found[-1]["u"]) == 0.0
 
@@ -469,7 +469,7 @@ def test_sensors_that_fail_end_the_run_and_everything_measured_is_kept(fault, en
     plant.fault = fault
     result = play(tmp_path / "run", plant, samples=100)
     assert (result.outcome, result.exit_status, plant.applied) == (ended, 1, 0.0)
-    assert plant.told[-1] == ("disarm",)
+    assert plant.calls[-1] == ("disarm",)
     measured = plant.reads - (ended == "plant")
     assert len(rows(tmp_path / "run")) == measured
     assert events(tmp_path / "run")[-1]["how"] == ended
@@ -482,9 +482,9 @@ def test_sensors_that_fail_end_the_run_and_everything_measured_is_kept(fault, en
         ("read", lambda y: "1.2 mm", "read must give one number, but gave '1.2 mm'"),
         ("read", lambda y: [y], r"read must give one number, but gave \["),
         ("apply", lambda u: None, "apply must give one number, but gave None"),
-        ("play", lambda told: told[1], r"play must give two arrays of \(16,\), inputs as applied and outputs, "),
-        ("play", lambda told: None, r"play must give two arrays of \(16,\), .* but gave None"),
-        ("play", lambda told: (told[0], "abc"), r"play must give two arrays of \(16,\), .* but gave \("),
+        ("play", lambda block: block[1], r"play must give two arrays of \(16,\), inputs as applied and outputs, "),
+        ("play", lambda block: None, r"play must give two arrays of \(16,\), .* but gave None"),
+        ("play", lambda block: (block[0], "abc"), r"play must give two arrays of \(16,\), .* but gave \("),
     ],
 )
 def test_a_plant_that_gives_something_else_ends_the_run_by_name(method, given, message, tmp_path):
@@ -514,11 +514,11 @@ def test_an_output_out_of_range_before_arming_arms_nothing(tmp_path):
     plant = Bench()
     plant.fault = lambda k, y: 0.1
     assert play(tmp_path / "run", plant).outcome == "range"
-    assert [kind for kind, *_ in plant.told] == ["disarm"]
+    assert [kind for kind, *_ in plant.calls] == ["disarm"]
 
 
 @pytest.mark.parametrize("options", [{}, {"block": 8}])
-def test_an_error_within_zeroes_and_is_told(options, tmp_path):
+def test_an_error_in_a_run_zeroes_the_input_and_is_reported(options, tmp_path):
     plant = Bench()
 
     def broken(samples):
@@ -534,8 +534,8 @@ def test_an_error_within_zeroes_and_is_told(options, tmp_path):
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["how"] == "error"
 
 
-def test_late_inputs_count_for_what_they_were(tmp_path):
-    """The plant takes 0.8 of a sampling step to apply an input, and does so in the middle of that."""
+def test_late_inputs_count_with_their_effective_value(tmp_path):
+    """The plant takes 0.8 sampling steps to apply an input, and the input changes in the middle of that time."""
     plant = Bench()
     apply = plant.apply
 
@@ -557,7 +557,7 @@ def test_late_inputs_count_for_what_they_were(tmp_path):
 
 
 def slow_to_read(steps, after=0):
-    """A plant whose reads after the first ones take so many sampling steps."""
+    """A plant whose reads after the first ones take ``steps`` sampling steps."""
     plant = Bench()
     read = plant.read
 
@@ -571,13 +571,13 @@ def slow_to_read(steps, after=0):
 
 
 @pytest.mark.parametrize("steps", [0.4, 5])
-def test_a_read_that_is_too_slow_is_told_before_anything_is_armed(steps, tmp_path):
+def test_a_read_that_is_too_slow_is_reported_before_anything_is_armed(steps, tmp_path):
     plant = slow_to_read(steps)
     result = play(tmp_path / "run", plant)
     assert (result.outcome, result.exit_status) == ("late", 1)
     assert f"came too late: read() took {20 * steps:g} ms and apply() 0 ms of a step of 20 ms; play" in result.message
     assert result.late_ticks == len(rows(tmp_path / "run")) >= 16
-    assert not any(told[0] == "arm" for told in plant.told)
+    assert not any(call[0] == "arm" for call in plant.calls)
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["message"] == result.message
 
 
@@ -594,7 +594,7 @@ def test_a_read_that_becomes_slow_ends_the_run_as_a_dead_sensor_does(steps, tmp_
     assert result.message.startswith("32 outputs in a row came too late")
 
 
-def test_a_run_that_left_its_range_tells_of_the_ticks_that_it_missed(tmp_path):
+def test_a_run_that_left_its_range_reports_its_missed_ticks(tmp_path):
     plant = slow_to_read(3, after=16)
     plant.fault = lambda k, y: 0.09 if k == 24 else y
     result = play(tmp_path / "run", plant, samples=128, stale=0)
@@ -620,7 +620,7 @@ def test_a_complete_run_that_lost_many_outputs_warns(tmp_path):
 
 
 @pytest.mark.parametrize("ended", ["complete", "SIGINT", "plant"])
-def test_every_warning_is_told_whatever_ended_the_run(ended, tmp_path):
+def test_every_warning_is_printed_whatever_ended_the_run(ended, tmp_path):
     known = Bench()
     known.arm(None)
     believed = identify(RIG, known.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 32), 8))).belief
@@ -628,12 +628,14 @@ def test_every_warning_is_told_whatever_ended_the_run(ended, tmp_path):
     plant.truth |= {"a": 1.1 * TRUTH["a"]}
     plant.fault = lambda k, y: 1 / 0 if k == 140 and ended == "plant" else y
 
-    def told(samples):
+    def on_progress(samples):
         if samples > 150 and ended == "SIGINT":
             signal.raise_signal(signal.SIGINT)
 
     plan = RunSettings(policy="prbs", samples=160, stale=0)
-    result = run_experiment(RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, on_progress=told)
+    result = run_experiment(
+        RIG, plant, tmp_path / "run", plan, prior=believed, clock=plant.clock, on_progress=on_progress
+    )
     assert result.outcome == ended
     assert "outputs came too late to be used: intervals may be too narrow" in result.message
     assert "the prior is wrong: identify" in result.message
@@ -692,7 +694,7 @@ def test_a_block_of_a_simulated_plant_takes_no_time_of_the_clock():
 
 
 def test_a_simulated_plant_does_not_catch_up_with_what_went_by_before_it_was_driven():
-    """What a run needs to load and to plan does not make its first ticks late."""
+    """The time to load and to plan does not make the first ticks late."""
     clock = JumpingClock()
     plant = SimulatedPlant(RIG, TRUTH, clock=clock)
     moved, move = [], plant._rk4_step
@@ -735,9 +737,9 @@ def test_the_command(folder, capsys):
     (folder / "rig.toml").write_text(RIG_FILE + "\n[instrument]\nseed = 3\n", encoding="utf-8-sig")
     words = ["--plant", "lab_of_tests:plant", "--policy", "prbs", "--samples", "64", "--block", "32", "--out", "run"]
     assert command(*words) == 0
-    told = capsys.readouterr().out
-    assert "90 % interval" in told
-    assert "kg" in told
+    printed = capsys.readouterr().out
+    assert "90 % interval" in printed
+    assert "kg" in printed
     assert Rig.from_file("rig.toml") == RIG
     assert command(*words) == 2
     assert "holds something" in capsys.readouterr().err
@@ -752,10 +754,10 @@ def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
     )
     words = ["--plant", "stuck_of_tests:plant", "--policy", "prbs", "--samples", "8", "--out", "run"]
     assert command(*words) == 1
-    told = capsys.readouterr()
-    assert "kg" in told.out
-    assert "duffing-env: complete, but the input could not be zeroed at the end" in told.err
-    assert "the watchdog has to" in told.err
+    streams = capsys.readouterr()
+    assert "kg" in streams.out
+    assert "duffing-env: complete, but the input could not be zeroed at the end" in streams.err
+    assert "the watchdog has to" in streams.err
 
 
 @table(
@@ -770,6 +772,6 @@ def test_the_command_fails_where_the_input_could_not_be_zeroed(folder, capsys):
         ("builtins:divmod", r"the table \[instrument\] of the rig file, but that failed: TypeError: divmod expected 2"),
     ],
 )
-def test_plants_that_are_none(folder, plant, message):
+def test_invalid_plants_are_refused(folder, plant, message):
     with pytest.raises(ValueError, match=message):
         load_plant(plant, RIG)

@@ -1,4 +1,4 @@
-"""The next experiment as a signal: within the limits, worth what is said of it, and readable again."""
+"""The next experiment as a signal: within the limits, as informative as stated, and readable again."""
 
 import csv
 import json
@@ -26,7 +26,7 @@ from estimator.models.duffing import duffing
 
 @pytest.fixture(scope="module")
 def designed():
-    """Policy to what it designs in 64 samples; the planner climbs from 4 candidates of noise, instead of 14."""
+    """Policy to its design of 64 samples; the planner refines 4 noise candidates instead of 14."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("agents.hardware.next_experiment._MAX_NOISE_STARTS", 4)
         return {
@@ -35,7 +35,7 @@ def designed():
 
 
 @pytest.mark.parametrize("policy", ["prbs", "efe", "velocity-sign"])
-def test_what_is_stated_after_an_experiment_is_what_was_expected(policy, designed):
+def test_deviations_after_an_experiment_equal_the_expected_ones(policy, designed):
     found = designed[policy]
     assert np.abs(found.u).max() <= RIG.input.limit
     assert found.exit_probability < 0.05
@@ -48,10 +48,10 @@ def test_what_is_stated_after_an_experiment_is_what_was_expected(policy, designe
     assert (median < high).all()
     assert max(-low.min(), high.max()) < RIG.output.range
     assert 0.6 < np.mean((low < y) & (y < high)) < 1.0
-    told = identify(RIG, (found.u, y)).parameters
+    parameters = identify(RIG, (found.u, y)).parameters
     for name in "mcab":
-        # The systems that are drawn differ by some tens of percent in what an input tells of each of their parameters.
-        assert 0.4 < told[name][1] / found.expected_stds[name] < 2.5
+        # The drawn systems differ by some tens of percent in the information about each parameter.
+        assert 0.4 < parameters[name][1] / found.expected_stds[name] < 2.5
 
 
 def test_the_planner_expects_more_of_its_signal(designed):
@@ -119,10 +119,10 @@ def test_the_command_goes_on_from_what_identify_saved(tmp_path, monkeypatch, cap
             "next.png",
         ]
     )
-    told = capsys.readouterr().out
-    assert "narrower" in told
-    assert "kg" in told
-    assert "The picture is next.png" in told
+    printed = capsys.readouterr().out
+    assert "narrower" in printed
+    assert "kg" in printed
+    assert "The picture is next.png" in printed
     assert (tmp_path / "next.png").read_bytes().startswith(b"\x89PNG")
     found = design_experiment(RIG, load_estimator("posterior.npz").belief, "prbs", 64)
     written = np.loadtxt("next.csv", delimiter=",", skiprows=1)
@@ -186,20 +186,20 @@ def test_a_column_that_the_rig_names_has_its_unit(tmp_path):
     assert table.unit(table.input_column) == "N"
 
 
-def test_a_signal_that_never_changes_is_told(tmp_path, capsys):
+def test_a_constant_signal_is_reported(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(RIG_FILE)
     for policy in ("prbs-8", "prbs"):
         main(["design", str(tmp_path / "rig.toml"), "--policy", policy, "--samples", "16"])
         assert ("every input is the same: prbs-8 holds" in capsys.readouterr().err) == (policy == "prbs-8")
 
 
-def test_too_few_samples_in_a_period_are_told(tmp_path, capsys):
+def test_too_few_samples_in_a_period_are_reported(tmp_path, capsys):
     (tmp_path / "fast.toml").write_text(RIG_FILE)
     (tmp_path / "slow.toml").write_text(RIG_FILE.replace("step = 0.02", "step = 0.3"))
     for name in ("fast", "slow"):
         main(["design", str(tmp_path / f"{name}.toml"), "--policy", "prbs", "--samples", "16"])
-        told = capsys.readouterr().err
-        assert ("has 1.7 samples in a period; sample faster" in told) == (name == "slow")
+        messages = capsys.readouterr().err
+        assert ("has 1.7 samples in a period; sample faster" in messages) == (name == "slow")
     # a = 110 to 180 N/m on about 1 kg: a period of 0.5 s.
     assert design_experiment(RIG, policy="prbs", samples=16).samples_per_period == pytest.approx(26, abs=1)
 
@@ -239,10 +239,10 @@ def test_a_run_goes_on_from_a_posterior(tmp_path, monkeypatch, jumping_clock):
     with pytest.raises(SystemExit) as left:
         main(["run", "rig.toml", "posterior.npz", *arguments])
     assert left.value.code == 0
-    told = json.loads((tmp_path / "next" / "parameters.json").read_text())
+    parameters = json.loads((tmp_path / "next" / "parameters.json").read_text())
     assert json.loads((tmp_path / "next" / "manifest.json").read_text())["message"] == ""
-    assert told["m"]["std"] < 0.9 * known.parameters["m"][1]
-    assert abs(told["m"]["mean"] - TRUTH["m"]) < 4 * told["m"]["std"]
+    assert parameters["m"]["std"] < 0.9 * known.parameters["m"][1]
+    assert abs(parameters["m"]["mean"] - TRUTH["m"]) < 4 * parameters["m"]["std"]
 
 
 @pytest.mark.parametrize("block", [None, 64])
@@ -267,7 +267,7 @@ def test_a_run_goes_on_from_one_that_ended_in_motion(tmp_path, block):
 
 
 @pytest.mark.parametrize("block", [None, 64])
-def test_a_posterior_that_the_plant_contradicts_is_told(tmp_path, block):
+def test_a_posterior_that_the_plant_contradicts_is_reported(tmp_path, block):
     plant = SimulatedPlant(RIG, TRUTH, clock=JumpingClock())
     plant.arm(None)
     u, y = plant.play(np.repeat(np.random.default_rng(0).choice([-3.0, 3.0], 32), 8))
@@ -282,7 +282,7 @@ def test_a_posterior_that_the_plant_contradicts_is_told(tmp_path, block):
     assert "the prior is wrong: identify" in wrong
 
 
-def test_the_instrument_s_table_tells_what_is_simulated(tmp_path):
+def test_the_instruments_table_gives_the_true_parameters(tmp_path):
     assert simulated(replace(RIG, guess=None), truth=TRUTH).truth == TRUTH
     with pytest.raises(ValueError, match="truth must give m, c, a and b"):
         simulated(RIG, truth={"a": 1.0})
@@ -301,6 +301,6 @@ def test_the_instrument_s_table_tells_what_is_simulated(tmp_path):
         ({"rig": replace(RIG, output=replace(RIG.output, range=1e-5))}, "even without input"),
     ],
 )
-def test_experiments_that_cannot_be(given, message):
+def test_impossible_experiments_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         design_experiment(**{"rig": RIG, "policy": "prbs", **given})

@@ -201,7 +201,7 @@ def assert_agrees(actual: Belief, outcome, operations: int) -> None:
     expected, scale = outcome.belief, outcome.scale
     size = np.where(scale > 0, scale, 1.0) + np.abs(expected.mean)
     np.testing.assert_array_less(np.abs(actual.mean - expected.mean), tolerance * size)
-    scale = scale + tolerance * np.abs(expected.mean)  # what is known is so to the rounding of its mean
+    scale = scale + tolerance * np.abs(expected.mean)  # a known quantity has only the rounding error of its mean
     allowed = tolerance * np.outer(scale, scale)
     assert (np.abs(actual.cov - expected.cov) <= allowed).all()
     for ours, theirs in zip((actual.gamma, *actual.xi), (expected.gamma, *expected.xi), strict=True):

@@ -63,7 +63,7 @@ def test_free_energies_of_an_update_equal_their_definition():
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-9)
 
 
-def test_quantities_that_depend_on_others_get_no_points():
+def test_dependent_quantities_get_no_sigma_points():
     case = CASES["van der pol"]
     samples = some_samples(case, 13)
     onto = np.eye(5)
@@ -77,7 +77,7 @@ def test_quantities_that_depend_on_others_get_no_points():
     np.testing.assert_allclose(weights[weights > 0], 1 / 6, rtol=4 * EPS)
 
 
-def test_a_belief_without_doubt_moves_with_its_mean():
+def test_a_belief_without_variance_moves_with_its_mean():
     case = CASES["pendulum"]
     belief, inputs, _ = some_samples(case, 14)[0]
     sure = replace(belief, cov=np.zeros((5, 5)))
@@ -161,7 +161,7 @@ def test_a_covariance_is_sound_or_flagged_at_any_scale(name):
         ({(2, 2): 0.0}, False),
     ],
 )
-def test_what_is_no_covariance_is_flagged(entries, flagged):
+def test_an_indefinite_matrix_is_flagged(entries, flagged):
     case = CASES["van der pol"]
     belief = random_belief(case, np.random.default_rng(17))
     cov = np.eye(5)

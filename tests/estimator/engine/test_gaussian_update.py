@@ -124,7 +124,7 @@ def test_what_is_generated_names_nothing_twice():
 
 
 @pytest.mark.parametrize(("name", "scale"), [("paper", 1e9), ("duffing", 1e3), ("wiener-hammerstein", 1e3)])
-def test_a_covariance_stays_one_whatever_the_samples(name, scale):
+def test_a_covariance_stays_positive_semidefinite_for_any_samples(name, scale):
     """Samples with 1e18 times the prior information, and rates too fast for the steps."""
     case = CASES[name]
     task = kernels.compile_belief_update(case.model, case.degree, lanes=LANES)
@@ -148,7 +148,7 @@ def test_a_covariance_stays_one_whatever_the_samples(name, scale):
     assert whole > 500
 
 
-def test_lanes_do_not_know_one_another():
+def test_lanes_are_independent():
     case = CASES["pendulum"]
     task = kernels.compile_belief_update(case.model, case.degree, iterations=2, lanes=LANES, may_be_missing=True)
     samples = some_samples(case, 10)

@@ -110,7 +110,7 @@ def assert_equals_reference(case, task, observed):
     Z_end = matrix(W, layout, lanes, lane, ("DX", states), names)
     np.testing.assert_allclose(Z_end, expected.sensitivity, atol=tolerance * reach, rtol=0)
     if observed:
-        # An error of the innovations e counts 1/√S: they are 1e2 of what is rounded.
+        # An error of the innovations e counts 1/√S: it is 1e2 times the rounding error.
         enlarged = tolerance / np.sqrt(R.min())
         total = SAMPLES * len(R) * (1 + abs(np.log(R.min())))
         assert at("LOSS") == pytest.approx(expected.loss, abs=enlarged * total)
@@ -206,7 +206,7 @@ def test_the_gradient_by_the_inputs_equals_differences(name, monkeypatch):
     np.testing.assert_allclose(directions @ found[2:], expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
-def test_a_lane_that_is_over_counts_nothing():
+def test_a_finished_lane_contributes_nothing():
     case = CASES["paper"]
     task = kernels.compile_linearised_filter(case.model, case.degree, follows_outputs=True, lanes=1)
     z, V, c, inputs, R, y = some_walk(case, 5)

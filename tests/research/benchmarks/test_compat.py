@@ -1,4 +1,4 @@
-"""What other libraries make of the environments: the rows of those that are in the lock, and a word for another."""
+"""Other libraries on the environments: the rows of the locked ones, and a missing library."""
 
 import sys
 
@@ -25,7 +25,7 @@ def test_a_keyword_that_is_none_is_refused_in_the_words_that_torchrl_looks_for()
         assert isinstance(caught.value, ValueError)
 
 
-def test_what_fails_is_told_and_counted(monkeypatch, capsys):
+def test_failures_are_printed_and_counted(monkeypatch, capsys):
     def fails():
         raise LookupError("no such thing\nand more")
 

@@ -64,14 +64,14 @@ def test_intervals_of_every_model_hold_the_truth(population):
     ],
     ids=["mean field", "noise priors too small", "noise priors too large", "first order of a wide prior"],
 )
-def test_where_the_manual_says_that_they_do_not(case):
+def test_intervals_miss_the_truth_where_the_manual_says_so(case):
     # docs/evidence/coverage.md names these as limits; and the check above can fail.
     result = evaluate(case, 120, 0)
     with pytest.raises(AssertionError):
         assert_calibrated(result)
 
 
-def test_those_of_another_equation_do_not():
+def test_intervals_of_another_equation_do_not_hold_the_truth():
     result = evaluate(Case(*SAME, 256, SAME, "track", estimator="nlarx"), 128, 1)
     assert set(result.hits) == PHYSICAL  # its coefficients have no truth
     assert result.hits["m"] == 0
@@ -81,7 +81,7 @@ def test_those_of_another_equation_do_not():
 
 
 @pytest.mark.slow  # seconds of compilation
-def test_sigma_points_mend_a_wide_prior():
+def test_sigma_points_calibrate_a_wide_prior():
     def result(expectations, spread):
         return evaluate(Case(*WIDE_NOISES, 256, WIDE_NOISES, "wide", spread, expectations=expectations), 100, 0)
 
@@ -98,7 +98,7 @@ def test_sigma_points_mend_a_wide_prior():
     [Case(2e-3, 1e-3, 256, SAME, hypotheses=HYPOTHESES), Case(*SAME, 256, (1.5e-3, 1.5e-3), hypotheses=HYPOTHESES)],
     ids=["noise priors too small", "noise priors too large"],
 )
-def test_an_ensemble_mends_wrong_noise_priors(case):
+def test_an_ensemble_calibrates_wrong_noise_priors(case):
     result = evaluate(case, 60, 0)
     assert_calibrated(result)
     assert result.ratio_std < 0.5
@@ -149,7 +149,7 @@ def test_the_prior_has_the_moments_of_the_draw(population):
     np.testing.assert_allclose(difference, 0, atol=8 / np.sqrt(systems))
 
 
-def test_none_of_a_wide_prior_is_near_zero():
+def test_no_draw_of_a_wide_prior_is_near_zero():
     truth = draw("wide", 2000, *WIDE_NOISES, 1, np.random.default_rng(2), 0.5).truth
     mean = recorded_prior(ODE).coefficients_mean
     assert (truth[:, :4] >= 0.1 * mean[:4]).all()
@@ -226,7 +226,7 @@ def test_wilson_interval_of_a_textbook_example():
     [case for title in CALIBRATED for case in tables()[title]],
     ids=lambda c: f"{c.population}-{c.hypotheses}-{c.process_noise}-{c.measurement_noise}-{c.samples}",
 )
-def test_full_coverage(case):
+def test_coverage_of_500_systems(case):
     result = evaluate(case, 500, 1)
     assert result.kept >= (binom.ppf(TAIL, 500, STAYS) if case.population == "cubic" else 490)
     for name, hits in result.hits.items():

@@ -33,7 +33,7 @@ def test_half_of_any_file_is_noticed(tmp_path):
         assert half_written(tmp_path) == []
 
 
-def test_commands_that_are_none_are_refused():
+def test_unknown_commands_are_refused():
     with pytest.raises(ValueError, match=r"commands must be of \['train', .*nothing"):
         main(Config(commands=("nothing",)))
 

@@ -1,4 +1,4 @@
-"""What is timed apart must be what the environment and the estimator do."""
+"""The functions that are timed separately compute the same as the environment and the estimator."""
 
 import gymnasium as gym
 import numpy as np

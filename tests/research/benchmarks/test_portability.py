@@ -40,7 +40,7 @@ def test_a_setting_reaches_the_tests(tmp_path):
 
 
 @pytest.mark.slow  # another pytest
-def test_what_cannot_run_is_no_pass(tmp_path):
+def test_tests_that_cannot_run_do_not_pass(tmp_path):
     with pytest.raises(OSError, match=r"the tests did not (run|end) under 'mine'"):
         run(Setting("mine", (str(tmp_path / "nothing"),)), 1, tmp_path)
 
@@ -52,7 +52,7 @@ def two_settings(monkeypatch):
     monkeypatch.setattr(portability, "processor_features", lambda: {"sse2"})
 
 
-def test_a_table_tells_what_this_processor_lacks(two_settings, monkeypatch, capsys):
+def test_the_table_names_missing_processor_features(two_settings, monkeypatch, capsys):
     monkeypatch.setattr(portability, "run", lambda *_: Outcome(7, (), 12.3))
     main(Config())
     printed = capsys.readouterr().out.splitlines()

@@ -165,7 +165,7 @@ def test_the_beam_is_filtered_before_it_is_decimated() -> None:
 
 
 @pytest.mark.parametrize("name", ["a", "e"])
-def test_faults_are_what_they_say(name: str) -> None:
+def test_faulty_records_have_the_named_fault(name: str) -> None:
     good, _ = faults.make_faulty_record("none", name, 0)
     late, _ = faults.make_faulty_record("one sample late", name, 0)
     clipped, _ = faults.make_faulty_record("output clipped", name, 0)
@@ -222,10 +222,10 @@ def test_the_verdicts_of_faults() -> None:
     assert not faults.passes_bar("none", faults.detection_rate("none", records))
 
 
-def test_the_sweep_reads_what_is_said_of_each_parameter() -> None:
+def test_the_sweep_reads_the_verdict_on_each_parameter() -> None:
     left = "not identified by this input; the records leave more than a third of it open"
-    told = outcome(bound=2.0, not_identified=f"c, b: {left}")
-    assert sampling_sweep.is_said_open([told]) == ([False, True, False, True], [])
+    trial = outcome(bound=2.0, not_identified=f"c, b: {left}")
+    assert sampling_sweep.is_said_open([trial]) == ([False, True, False, True], [])
     wrong = outcome(bound=0.01, not_identified=f"b: {left}")
     assert sampling_sweep.is_said_open([wrong]) == ([], [False, False, False, True])
 
@@ -247,7 +247,7 @@ def test_ratios_are_geometric_means() -> None:
     assert 0.89 * 200 < inside < 200
 
 
-def test_what_a_user_of_ours_writes_is_short() -> None:
+def test_user_code_for_identify_is_short() -> None:
     assert peer_comparison.count_statements(peer_comparison.ours) == 2
 
 

@@ -1,4 +1,4 @@
-"""Operations are those that one counts by hand, and the yardsticks do what they say."""
+"""Operation counts equal counts by hand, and the yardsticks compute what they state."""
 
 import pytest
 

@@ -56,7 +56,7 @@ def test_a_row_that_fails_is_reported_and_the_others_go_on() -> None:
     assert len(results["ours"].values) == 2
 
 
-def test_a_row_that_fails_later_keeps_none_of_its_values() -> None:
+def test_a_row_that_fails_later_has_no_values() -> None:
     seconds = iter([1.0])
 
     def run(count: int) -> tuple[float, float]:
