@@ -88,7 +88,8 @@ class DuffingVecEnv(BatchVecEnv):
             ``autoreset_mode="SameStep"``, wrapped or not, and then without further options.
         num_envs: number of rows; of a given vector environment, its own.
         seed: of the batch; the next reset uses it.
-        levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by index; 0: any input between.
+        levels: number of evenly spaced inputs from -1 to 1, of which an action is one, by index, for each of several
+            inputs; 0: any input between.
         options: of the environment, and ``threads``.
 
     Raises:
@@ -130,10 +131,16 @@ class DuffingVecEnv(BatchVecEnv):
         self.render_mode = None
         self._n_levels = levels
         self._levels = np.linspace(-1.0, 1.0, levels, dtype=np.float32) if levels else None
-        action_space = gym.spaces.Discrete(levels) if levels else vector_env.single_action_space
+        action_space: gym.Space[Any] = vector_env.single_action_space
+        self._n_inputs = vector_env.unwrapped.experiment.model.n_inputs
+        if levels:
+            several = self._n_inputs > 1
+            action_space = (
+                gym.spaces.MultiDiscrete([levels] * self._n_inputs) if several else gym.spaces.Discrete(levels)
+            )
         super().__init__(num_envs, vector_env.single_observation_space, action_space)
         self._seed_of_batch = seed
-        self._actions = np.zeros((num_envs, 1), dtype=np.float32)
+        self._actions = np.zeros((num_envs, self._n_inputs), dtype=np.float32)
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
         self._started = time.perf_counter()
@@ -177,7 +184,7 @@ class DuffingVecEnv(BatchVecEnv):
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Take the actions of the next `step_wait`."""
-        self._actions = actions if self._levels is None else self._levels[actions][:, None]
+        self._actions = actions if self._levels is None else self._levels[actions].reshape(-1, self._n_inputs)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all rows; rows that finish start their next episode."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,9 +11,11 @@ import numpy.typing as npt
 from duffing_env.experiment_config import Experiment
 from duffing_env.kernel import RESET_ONLY, compile_kernel
 from duffing_env.kernel_stages.noise_filter_bank import interleave_width, member_row_count, n_member_blocks
+from duffing_env.numba_threads import numba_thread_context
 from duffing_env.storage.array_pool import ArrayPool
 from duffing_env.storage.kernel_spec import (
     OUTCOME_ROWS,
+    applied_row,
     block_layout,
     noise_std_rows,
     observation_bounds,
@@ -31,10 +30,8 @@ from estimator.support.array_types import FloatArray
 
 _OUTCOME_NAMES = tuple(name.lower() for name in OUTCOME_ROWS)
 
-#: Process that has stepped with Numba's threads, which its children do not inherit.
-_threaded_process: int | None = None
-
-_threading_lock = threading.Lock()
+#: Attributes that are views of others.
+_FLAT_VIEWS = ("_flat_actions", "_flat_blocks", "_flat_ended")
 
 
 class Batch:
@@ -82,17 +79,17 @@ class Batch:
         self._truth_scales = np.array([physical_unit_factor(experiment, name) for name in self._truth_rows])
         n_rows, n_observation = max(self._row_of.values()) + 1, len(observation_bounds(experiment.model))
         # A copy: Numba types a read-only array differently, and would compile the step anew.
-        self._replayed_record = np.stack(experiment.replayed_record)
+        self._replayed_record = np.array(experiment.replayed_record)
         n_blocks = -(-size // LANES)
         padded = n_blocks * LANES
         self._blocks = np.zeros((n_blocks, n_rows, LANES))
-        self._flat_blocks = self._blocks.reshape(n_blocks, -1)
         n_members = n_member_blocks(size, len(self._params.hypothesis_priors))
         self._members = np.zeros((n_members, member_row_count(self._spec) * LANES))
         self._ended = np.zeros_like(self._blocks)
-        self._flat_ended = self._ended.reshape(n_blocks, -1)
         self._workspace = np.zeros((threads, 2 * n_rows * LANES))
-        self._actions = np.zeros(padded, dtype=np.float32)
+        self._actions = np.zeros((padded, experiment.model.n_inputs), dtype=np.float32)
+        self._flatten()
+        self._applied_rows = [applied_row(name) for name in experiment.model.inputs]
         self._observation_pool = ArrayPool((padded, n_observation), np.float32)
         self._outcome_pool = ArrayPool((len(OUTCOME_ROWS), padded), np.float64)
         self.renew_output_arrays()
@@ -191,7 +188,7 @@ class Batch:
             self.observations = self._observations[: self.size]
 
     def step(self, actions: npt.ArrayLike) -> None:
-        """Apply actions (n,) for a step, in parts of the largest input; float32, clipped to [-1, 1]."""
+        """Apply actions (n, inputs) for a step, in parts of the largest inputs; float32, clipped to [-1, 1]."""
         self._actions[: self.size] = actions
         self._run_kernel(self._reset_mode)
 
@@ -199,7 +196,7 @@ class Batch:
         self, reset_mode: int, packed_params: FloatArray | None = None, blocks: tuple[int, int] | None = None
     ) -> None:
         arguments = (
-            self._actions, self._packed_params if packed_params is None else packed_params, self._replayed_record,
+            self._flat_actions, self._packed_params if packed_params is None else packed_params, self._replayed_record,
             reset_mode, self._mask, self._observations, self._outcomes, self._final_observations, self._flat_ended,
         )  # fmt: skip
         if blocks is not None:
@@ -215,9 +212,9 @@ class Batch:
         """The state from which the next step continues, and the last observations: the arrays themselves."""
         return {"blocks": self._blocks, "members": self._members, "observations": self._observations}
 
-    def set_measured_sample(self, u: float, y: float) -> None:
-        """Set the input and output of the next step, in an experiment that replays a record of one sample."""
-        self._replayed_record[:, 0] = u, y
+    def set_measured_sample(self, u: npt.ArrayLike, y: float) -> None:
+        """Set inputs (inputs,) and output of the next step, in an experiment that replays a record of one sample."""
+        self._replayed_record[:-1, 0], self._replayed_record[-1, 0] = u, y
 
     def outcome(self, index: int) -> dict[str, float]:
         """The outcome of the last step for one environment, by names in lower case."""
@@ -226,6 +223,10 @@ class Batch:
     def row_values(self, name: str) -> FloatArray:
         """(n,) current values of a row; a copy."""
         return self._blocks[:, self._row_of[name]].flatten()[: self.size]
+
+    def applied_inputs(self, ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+        """(n, inputs) the inputs that were applied in the last sample; ``ended`` as for `row_matrix`."""
+        return self.row_matrix(self._applied_rows, ended)
 
     def records(self, ended: npt.NDArray[np.bool_] | None = None) -> FloatArray:
         """(n, size) the beliefs now, as flat records (`estimator.Belief`); a copy. ``ended`` as for `row_matrix`."""
@@ -298,18 +299,23 @@ class Batch:
         found: FloatArray = stored[blocks[:, None], first + np.arange(count), lanes[:, None]]
         return found
 
+    def _flatten(self) -> None:
+        """Make the views that the kernel takes."""
+        self._flat_actions = self._actions.reshape(-1)
+        self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
+        self._flat_ended = self._ended.reshape(len(self._ended), -1)
+
     def __getstate__(self) -> dict[str, Any]:
         """The state without views, so that copies and pickles share no memory through them."""
         state = self.__dict__.copy()
-        for view in ("observations", "final_observations", "outcomes", "_flat_blocks", "_flat_ended", "_kernel"):
+        for view in ("observations", "final_observations", "outcomes", *_FLAT_VIEWS, "_kernel"):
             del state[view]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._kernel = compile_kernel(self._spec)
-        self._flat_blocks = self._blocks.reshape(len(self._blocks), -1)
-        self._flat_ended = self._ended.reshape(len(self._ended), -1)
+        self._flatten()
         self.observations = self._observations[: self.size]
         self.final_observations = self._final_observations[: self.size]
         self.outcomes = self._outcomes[:, : self.size]
@@ -330,19 +336,3 @@ def spawn_seeds(seed: int | None, count: int) -> list[int]:
     """
     children = np.random.SeedSequence(seed).spawn(count)
     return [int(child.generate_state(1, np.uint64)[0]) for child in children]
-
-
-def numba_thread_context(n_threads: int) -> AbstractContextManager[object] | None:
-    """The context in which Numba may step with ``n_threads`` threads; None where it may not.
-
-    It may not in the child of a process that has stepped with threads; one thread then gives the same results. The
-    threading layer ``workqueue`` ends the process if two Python threads enter it at once, so there they wait.
-    """
-    import numba
-
-    global _threaded_process
-    _threaded_process = _threaded_process or os.getpid()
-    if _threaded_process != os.getpid():
-        return None
-    numba.set_num_threads(n_threads)
-    return _threading_lock if numba.threading_layer() == "workqueue" else nullcontext()

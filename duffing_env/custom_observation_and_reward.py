@@ -31,7 +31,7 @@ def experiment_observation_bounds(experiment: Experiment) -> FloatArray:
     elif observation == "privileged":
         bounds = posterior + [(-OBSERVATION_BOUND, OBSERVATION_BOUND)] * model.n_coefficients
     elif observation == "history":
-        history_bounds = posterior[-3 - model.n_outputs : -2]
+        history_bounds = posterior[-2 - model.n_inputs - model.n_outputs : -2]
         bounds = history_bounds * experiment.history + posterior[-2:]
     else:
         bounds = [(-OBSERVATION_BOUND, OBSERVATION_BOUND)] * _evaluate_observation(
@@ -94,7 +94,8 @@ class CustomFunctions:
         self._batch, self._model = batch, experiment.model
         self._observation, self._reward = experiment.observation, experiment.reward
         self._low, self._high = experiment_observation_bounds(experiment).T.astype(np.float32)
-        self._history = np.zeros((batch.size, experiment.history, 1 + self._model.n_outputs), dtype=np.float32)
+        self._n_shown = self._model.n_inputs + self._model.n_outputs
+        self._history = np.zeros((batch.size, experiment.history, self._n_shown), dtype=np.float32)
         self._prior, self._inverse_std = (
             experiment.prior_belief.coefficients_mean,
             experiment.kernel_params.prior_inverse_std,
@@ -139,11 +140,12 @@ class CustomFunctions:
             Beliefs(self._model, records, scales) for records in (self._records_before, batch.records(ended))
         )
         first_sensor = next(iter(batch.experiment.truth_model.outputs))
-        u, y = (batch.row_matrix(["INPUT", f"Y_{first_sensor}"], ended) * (scales.input, scales.output)).T
+        u, y = batch.applied_inputs(ended) * scales.input, batch.row_matrix([f"Y_{first_sensor}"], ended)[:, 0]
+        u, y = u[:, 0] if u.shape[1] == 1 else u, y * scales.output
         truth = batch.truth(ended) if batch.experiment.knows_truth else None
         if hasattr(self._reward, "py_func"):  # compiled by Numba
             paid = np.empty(n)
-            truths_and_inputs = np.stack([*(truth or {}).values(), u], axis=1)
+            truths_and_inputs = np.column_stack([*(truth or {}).values(), u])
             loop = _compile_reward_loop(self._reward, tuple(truth or ()))
             loop(BeliefRow.columns(before), BeliefRow.columns(after), u.copy(), y.copy(), truths_and_inputs, paid)
         else:
@@ -169,7 +171,7 @@ class CustomFunctions:
     def _append_history(self, observations: npt.NDArray[np.float32]) -> None:
         if self._observation == "history":
             self._history = np.roll(self._history, -1, axis=1)
-            self._history[:, -1] = observations[:, -3 - self._model.n_outputs : -2]
+            self._history[:, -1] = observations[:, -2 - self._n_shown : -2]
 
     def _select_observations(
         self, observations: npt.NDArray[np.float32], ended: Flags | None

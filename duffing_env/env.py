@@ -1,4 +1,4 @@
-"""The single environment as `gymnasium.Env`: one experiment, one input per step."""
+"""The single environment as `gymnasium.Env`: one experiment, one action per step."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from duffing_env.env_common import (
     ExperimentEnv,
     action_space,
     check_reset_options,
+    checked_action,
     make_experiment,
     observation_space,
     refuse_concurrent_calls,
-    scalar_action,
 )
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
@@ -26,6 +26,7 @@ from duffing_env.storage.kernel_spec import SUMMED_OUTCOMES
 from estimator.belief import Belief
 from estimator.models.named_parameters import Parameters
 from estimator.support.argument_checks import check_choice
+from estimator.support.array_types import FloatArray
 
 if TYPE_CHECKING:
     from duffing_env.rendering.episode_renderer import EpisodeRenderer
@@ -199,7 +200,8 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
             check_choice("render_mode", render_mode, self.metadata["render_modes"])
         self.experiment = make_experiment(self.experiment_class, options)
         self.observation_space = observation_space(self.experiment)
-        self.action_space = action_space()
+        self.action_space = action_space(self.experiment)
+        self._n_inputs = self.experiment.model.n_inputs
         self.render_mode = render_mode
         self._batch = Batch(self.experiment, 1, RESET_MANUALLY)
         self._custom = CustomFunctions.for_batch(self._batch)
@@ -258,15 +260,15 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
 
     @refuse_concurrent_calls
     def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Apply one input for ``hold`` samples, or until the episode ends.
+        """Apply the inputs of an action for ``hold`` samples, or until the episode ends.
 
         Raises:
-            ValueError: if the action is not one finite number; nothing has changed then.
+            ValueError: if the action is not one finite number for each input; nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset, and after the end of an episode.
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        clipped_action, custom = scalar_action(action), self._custom
+        clipped_action, custom = checked_action(action, self._n_inputs), self._custom
         if custom is not None:
             custom.before_step()
         outcome = self._play_action(clipped_action)
@@ -295,7 +297,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
             info[flag] = bool(outcome[flag])
         return info
 
-    def _play_action(self, action: float) -> dict[str, float]:
+    def _play_action(self, action: float | FloatArray) -> dict[str, float]:
         """Hold the action for its samples; return the sums of their rewards and gains, and the last one's flags."""
         # The kernel can hold an action as well; here each sample is a call, as it is drawn or given to a real plant.
         outcome = self._play_sample(action)
@@ -307,14 +309,14 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
                 outcome[name.lower()] += before[name.lower()]
         return outcome
 
-    def _play_sample(self, action: float) -> dict[str, float]:
+    def _play_sample(self, action: float | FloatArray) -> dict[str, float]:
         self._apply_sample(action)
         if self._renderer is not None:
             self._draw_sample()
         return self._batch.outcome(0)
 
-    def _apply_sample(self, action: float) -> None:
-        """Step one sample; the action is in [-1, 1]."""
+    def _apply_sample(self, action: float | FloatArray) -> None:
+        """Step one sample; the action is in [-1, 1], or has (inputs,) such numbers."""
         self._batch.step(action)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
@@ -328,14 +330,15 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         from duffing_env.rendering.episode_renderer import EpisodeRenderer
 
         if self._renderer is None:
-            limits, fps = (self.max_input, self.experiment.max_output), self.metadata["render_fps"]
-            self._renderer = EpisodeRenderer(self.render_mode, *limits, fps, self.experiment.scales)
+            experiment, fps = self.experiment, self.metadata["render_fps"]
+            limits = dict(zip(experiment.model.inputs, experiment.max_inputs.tolist(), strict=True))
+            self._renderer = EpisodeRenderer(self.render_mode, limits, experiment.max_output, fps, experiment.scales)
         self._renderer.start(self._batch.truth_of(0), self.belief, self.horizon)
 
     def _draw_sample(self) -> None:
         assert self._renderer is not None
-        u, y = self._batch.row_values("INPUT")[0], self._batch.row_values(f"Y_{self._first_sensor}")[0]
-        self._renderer.add_sample(float(u), float(y), self.belief)
+        u, y = self._batch.applied_inputs()[0], self._batch.row_values(f"Y_{self._first_sensor}")[0]
+        self._renderer.add_sample(u, float(y), self.belief)
 
     def close(self) -> None:
         """Close the window, if there is one."""

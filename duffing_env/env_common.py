@@ -31,12 +31,32 @@ def observation_space(experiment: Experiment) -> spaces.Box:
     return spaces.Box(low.copy(), high.copy(), dtype=np.float32)
 
 
-def action_space() -> spaces.Box:
-    """The action space: the input in parts of the largest."""
-    return spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+def action_space(experiment: Experiment) -> spaces.Box:
+    """The action space: each input in parts of its largest."""
+    return spaces.Box(-1.0, 1.0, (experiment.model.n_inputs,), dtype=np.float32)
 
 
-def scalar_action(action: npt.ArrayLike) -> float:
+def checked_action(action: npt.ArrayLike, n_inputs: int) -> float | FloatArray:
+    """The action clipped to [-1, 1]: a number for one input, (inputs,) numbers for several.
+
+    Raises:
+        ValueError: for an action that is not one finite number for each input.
+    """
+    if n_inputs == 1:
+        return _scalar_action(action)
+    try:
+        values = to_float_array("action", action)
+    except ValueError:
+        values = np.array(math.nan)
+    if values.shape != (n_inputs,) or not np.isfinite(values).all():
+        raise ValueError(
+            f"action must be {n_inputs} finite numbers in [-1, 1], one for each input, but is {short_repr(action)}"
+        )
+    clipped: FloatArray = np.clip(values, -1.0, 1.0)
+    return clipped
+
+
+def _scalar_action(action: npt.ArrayLike) -> float:
     """The action as one number, clipped to [-1, 1].
 
     Raises:
@@ -173,7 +193,7 @@ class ExperimentEnv:
         """(environments, entries) the observations of the last reset or step; not a copy."""
         return self._observation_owner.observations
 
-    #: Input of the action 1 [V].
+    #: Input of the action 1, or by the names of several inputs.
     max_input: Any = ReadOnlyOption("max_input", "experiment.max_input")
 
     #: Samples of an episode without an early end.

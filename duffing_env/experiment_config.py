@@ -5,14 +5,16 @@ The fields of these classes are the keyword arguments of `gymnasium.make`; JSON 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
 from duffing_env.belief_arrays import Beliefs, check_observation
+from duffing_env.input_options import ByInput, check_has_inputs, checked_by_input, numbers_by_input
+from duffing_env.prior_checks import check_nominal_parameters, check_prior
 from duffing_env.rewards.named_rewards import check_reward, kernel_reward
 from duffing_env.storage.kernel_spec import KernelParams, KernelSpec, parameter_names
 from duffing_env.storage.random_streams import SEED_BRANCHES
@@ -26,12 +28,10 @@ from estimator.rigs.units import Scales
 from estimator.settings import checked_noise_hypotheses
 from estimator.support.argument_checks import (
     MAX_MAGNITUDE,
-    MIN_MAGNITUDE,
     check_bool,
     check_choice,
     check_integer,
     check_number,
-    short_repr,
 )
 from estimator.support.array_types import FloatArray
 from estimator.support.update_options import DEFAULT_ITERATIONS, MAX_ITERATIONS
@@ -55,7 +55,7 @@ class Experiment:
     reward: str | Callable[..., Any] = "information_gain"
     observation: str | Callable[[Beliefs], Any] = "posterior"
     history: int = 16
-    max_input: float = 0.15
+    max_input: ByInput = 0.15
     max_output: float = 0.6
     hold: int = 1
     terminal: bool = False
@@ -77,8 +77,10 @@ class Experiment:
         if callable(self.reward) and (self.terminal or self.terminated_return is not None):
             raise ValueError("terminal and terminated_return must be left out where reward is a function")
         check_observation(self.observation, self.history)
-        for name in ("max_input", "max_output"):  # a larger limit lets an oscillator diverge, and its episode end
-            check_number(name, getattr(self, name), maximum=1e300)
+        check_has_inputs(self.model)
+        # A larger limit lets an oscillator diverge, and its episode end.
+        object.__setattr__(self, "max_input", checked_by_input("max_input", self.max_input, self.model, 1e300))
+        check_number("max_output", self.max_output, maximum=1e300)
         check_integer("hold", self.hold, MAX_SAMPLES)
         check_bool("terminal", self.terminal)
         if self.terminated_return is not None:
@@ -135,9 +137,14 @@ class Experiment:
         return {name: twin.get(name, 1.0) for name in parameter_names(self.truth_model)}
 
     @property
-    def replayed_record(self) -> tuple[FloatArray, FloatArray]:
-        """Recorded input and output; one sample of each where the plant is simulated."""
-        return np.zeros(1), np.zeros(1)
+    def max_inputs(self) -> FloatArray:
+        """(inputs,) inputs of the action 1, in the order of the model."""
+        return numbers_by_input(self.max_input, self.model)  # type: ignore[arg-type]
+
+    @property
+    def replayed_record(self) -> FloatArray:
+        """(inputs + 1, T) recorded inputs and outputs; one sample where the plant is simulated."""
+        return np.zeros((self.model.n_inputs + 1, 1))
 
     @property
     def plant_params(self) -> dict[str, Any]:
@@ -175,7 +182,7 @@ class Experiment:
             plant_fields["hypothesis_priors"] = np.column_stack([members[:, -4:], weights])
         precisions = first_record[-2 - 2 * model.n_outputs :]
         values: dict[str, Any] = {
-            "max_input": float(self.max_input),
+            "max_input": self.max_inputs,
             "max_output": float(self.max_output),
             "horizon": float(self.samples),
             "iterations": self._n_iterations,
@@ -191,6 +198,8 @@ class Experiment:
             "prior": first_record.copy(),
             "prior_inverse_std": 1.0 / np.sqrt(np.diag(prior.coefficients_cov)),
             "prior_log_precisions": np.log(precisions[::2] / precisions[1::2]),
+            "max_slew": np.full(model.n_inputs, np.inf),
+            "sqrt_input_cost": np.zeros(model.n_inputs),
         }
         return KernelParams(**(values | plant_fields))
 
@@ -214,7 +223,7 @@ class SimulatedExperiment(Experiment):
     prior: Belief | None = None
     plant_spread: float | None = None
     max_rms: float | None = None
-    max_slew: float | None = None
+    max_slew: ByInput | None = None
     input_cost: float = 0.0
     jump: float = 0.0
     drift: float = 0.0
@@ -227,9 +236,11 @@ class SimulatedExperiment(Experiment):
         check_number("spread", self.spread, *SPREAD_LIMITS, "masses are positive, and none is known so well before")
         if self.plant_spread is not None:
             check_number("plant_spread", self.plant_spread, 0, SPREAD_LIMITS[1], "0 is the twin itself")
-        for name in ("max_rms", "max_slew", "process_noise_guess", "measurement_noise_guess"):
+        for name in ("max_rms", "process_noise_guess", "measurement_noise_guess"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name))
+        if self.max_slew is not None:
+            object.__setattr__(self, "max_slew", checked_by_input("max_slew", self.max_slew, self.model))
         check_number("noise_range", self.noise_range, 1, MAX_MAGNITUDE, "1 draws no noises")
         for name, limit in (("input_cost", MAX_MAGNITUDE), ("jump", SPREAD_LIMITS[1]), ("drift", 1.0)):
             check_number(name, getattr(self, name), 0, limit, "0 does without it")
@@ -293,48 +304,9 @@ class SimulatedExperiment(Experiment):
             "noise_range": float(self.noise_range),
             "spread": float(self.spread if self.plant_spread is None else self.plant_spread),
             "budget": np.inf if self.max_rms is None else self.horizon * self.max_rms * self.max_rms,
-            "max_slew": np.inf if self.max_slew is None else float(self.max_slew),
-            "sqrt_input_cost": float(np.sqrt(self.input_cost)) / self.max_input,
+            "max_slew": numbers_by_input(self.max_slew, self.model),  # type: ignore[arg-type]
+            "sqrt_input_cost": float(np.sqrt(self.input_cost)) / self.max_inputs,
             "jump": float(self.jump),
             "has_drift": self.drift > 0,
             "walk_variances": self.drift**2 * np.diag(self.prior_belief.coefficients_cov),
         }
-
-
-def check_nominal_parameters(means: Mapping[str, float] | None, names: Sequence[str]) -> None:
-    """Refuse unknown parameters, and values that cannot be the middle of a parameter's range.
-
-    Raises:
-        ValueError: with the parameter and its value.
-    """
-    if means is None:
-        return
-    if not isinstance(means, Mapping) or not set(means) <= set(names):
-        raise ValueError(f"mean must give some of the parameters {list(names)}, but is {short_repr(means)}")
-    for name, value in means.items():
-        check_number(f"mean[{name!r}]", value, MIN_MAGNITUDE if name == "m" else -MAX_MAGNITUDE)
-
-
-def check_prior(prior: Belief | None, scales: Scales, model: Model | None = None) -> None:
-    """Refuse a prior that is no belief, has other scales, or is of another model than ``model``, if that is given.
-
-    Raises:
-        ValueError: with the differences and the remedy.
-    """
-    if not isinstance(prior, Belief):
-        raise ValueError(f"prior must be an estimator.Belief or None, but is {short_repr(prior)}")
-    if prior.scales != scales:
-        scale_words = {"input": "limit", "output": "range", "order": "order of the output's derivative"}
-        differences = [
-            (scale_words.get(name, name.replace("_", " ")), getattr(prior.scales, name), required)
-            for name, required in asdict(scales).items()
-            if required != getattr(prior.scales, name)
-        ]
-        found = " and ".join(f"{name} {value!r}" for name, value, _ in differences)
-        wanted = " and ".join(f"{name} {value!r}" for name, _, value in differences)
-        raise ValueError(
-            f"prior must have the scales of the rig, but was saved with {found}, and the rig says {wanted}; identify "
-            f"once more with the present rig and save that, or change the rig back"
-        )
-    if model is not None and prior.model != model:
-        raise ValueError(f"prior must be of the model {model.name!r}, but is of {prior.model.name!r}")

@@ -12,7 +12,7 @@ from typing import Any
 
 from numba import prange
 
-from duffing_env.kernel_stages import plant_stages, sample_stages
+from duffing_env.kernel_stages import input_limits, plant_stages, sample_stages
 from duffing_env.kernel_stages.generated_environment_functions import generated_functions
 from duffing_env.kernel_stages.noise_filter_bank import NO_FILTER_BANK, compile_filter_bank
 from duffing_env.rewards.named_rewards import compile_reward_hooks
@@ -44,12 +44,13 @@ class Kernel:
     Attributes:
         step: ``step(first, stop, blocks, members, workspace, actions, packed_params, recorded, reset_mode, mask,
             observations, outcomes, final_observations, ended)`` steps the blocks from ``first`` to ``stop`` on the
-            calling thread. ``workspace`` (2 rows * LANES,) is scratch. ``actions`` (n,) are inputs in parts of the
-            largest. ``recorded`` (2, T) holds the inputs and outputs of the record to replay, and one sample where a
-            plant is simulated. ``reset_mode`` says how finished environments are reset; RESET_ONLY only starts episodes
-            where ``mask`` (n,) is true. The function writes ``observations`` (n, entries) float32 and ``outcomes``
-            (len(OUTCOME_ROWS), n). For environments reset within this step it also writes ``final_observations``, like
-            ``observations``, and ``ended`` (n_blocks, rows * LANES), their rows at the end of the episode.
+            calling thread. ``workspace`` (2 rows * LANES,) is scratch. ``actions`` (n * inputs,) are the inputs of each
+            environment in parts of their largest. ``recorded`` (inputs + 1, T) holds the inputs and outputs of the
+            record to replay, and one sample where a plant is simulated. ``reset_mode`` says how finished environments
+            are reset; RESET_ONLY only starts episodes where ``mask`` (n,) is true. The function writes ``observations``
+            (n, entries) float32 and ``outcomes`` (len(OUTCOME_ROWS), n). For environments reset within this step it
+            also writes ``final_observations``, like ``observations``, and ``ended`` (n_blocks, rows * LANES), their
+            rows at the end of the episode.
         step_parallel: the same for all blocks, on one Numba thread for each row of ``workspace``
             (threads, 2 rows * LANES).
     """
@@ -101,7 +102,7 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
 
     draw_noise, hooks = plant_stages.compile_noise_draw(row_of), compile_reward_hooks(spec, generated)
     _, before_plant_step, before_update, after_update = hooks
-    apply_input, replay_sample = sample_stages.compile_input(spec), sample_stages.compile_replay(spec)
+    apply_input, replay_sample = input_limits.compile_input(spec, generated), sample_stages.compile_replay(spec)
     simulate_sample: Any = sample_stages.compile_simulation(spec, generated, draw_noise) if is_simulated else None
     add_random_walk, update_belief = generated.add_random_walk, sample_stages.compile_update(spec)
     reset_filter_bank, update_filter_bank = compile_filter_bank(spec) if has_noise_hypotheses else NO_FILTER_BANK
@@ -155,9 +156,8 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
                     update_belief(W, params.iterations, params.as_published)
                 after_update(W, params)
                 finish_step(
-                    W, params.step, params.max_output, params.horizon, params.sqrt_input_cost, params.reward_weights[0],
-                    params.reward_weights[1], params.reward_weights[2], params.reward_weights[3],
-                )  # fmt: skip
+                    W, params.step, params.max_output, params.horizon, params.sqrt_input_cost, params.reward_weights
+                )
                 if params.terminal or params.has_terminated_return:
                     pay_reward(W, params.terminal, params.has_terminated_return, params.terminated_return)
                 restore_broken_beliefs(W, workspace)
@@ -187,8 +187,7 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
             for observation_pass in range(2):
                 observe(
                     W, workspace, params.prior, params.prior_inverse_std, params.prior_log_precisions,
-                    1.0 / params.max_output, 1.0 / params.max_input, params.horizon, 1.0 / params.horizon,
-                    params.budget,
+                    params.max_input, 1.0 / params.max_output, params.horizon, 1.0 / params.horizon, params.budget,
                 )  # fmt: skip
                 for j in range(LANES):
                     for k in range(n_observation):

@@ -134,7 +134,8 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
                 f"num_envs must leave room for {n_hypotheses or 1} beliefs and {n_observed} observed numbers in each "
                 f"of {num_envs} environments, at most {MAX_ENVS} and {_MAX_OBSERVED_NUMBERS} in all; take fewer"
             )
-        self.single_action_space = action_space()
+        self.single_action_space = action_space(self.experiment)
+        self._action_shape = (self.num_envs, self.experiment.model.n_inputs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         reset_mode = _RESET_MODES[self._autoreset_mode]
@@ -202,22 +203,21 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
     def step(
         self, actions: npt.NDArray[np.float32]
     ) -> tuple[Observations, npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
-        """Apply one input to each row, for ``hold`` samples.
+        """Apply the inputs of an action to each row, for ``hold`` samples.
 
         Raises:
-            ValueError: if the actions are not finite numbers of shape (num_envs, 1); nothing has changed then.
+            ValueError: if the actions are not finite numbers of shape (num_envs, inputs); nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset; with ``DISABLED`` also for finished rows.
         """
         if type(actions) is not np.ndarray or actions.dtype.kind != "f":
             actions = to_float_array("actions", actions)  # type: ignore[assignment]
-        if actions.shape != (self.num_envs, 1):
-            raise ValueError(f"actions must have shape {(self.num_envs, 1)}, but have {actions.shape}; one per row")
-        inputs = actions[:, 0]
-        if not math.isfinite(inputs.sum()) and not np.isfinite(inputs).all():
-            row = int(np.argmin(np.isfinite(actions)))
-            raise ValueError(f"actions must be finite, but row {row} is {actions[row, 0]}; pass values in [-1, 1]")
-        if inputs.dtype != np.float32:
-            inputs = np.clip(inputs, -1.0, 1.0)
+        if actions.shape != self._action_shape:
+            raise ValueError(f"actions must have shape {self._action_shape}, but have {actions.shape}; one per row")
+        if not math.isfinite(actions.sum()) and not np.isfinite(actions).all():
+            row, place = np.argwhere(~np.isfinite(actions))[0].tolist()
+            raise ValueError(f"actions must be finite, but row {row} is {actions[row, place]}; pass values in [-1, 1]")
+        if actions.dtype != np.float32:
+            actions = np.clip(actions, -1.0, 1.0)  # type: ignore[assignment]
         if self._any_needs_reset:
             needs_reset = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
             rows = np.flatnonzero(needs_reset).tolist()
@@ -226,7 +226,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
         custom = self._custom
         if custom is not None:
             custom.before_step()
-        self._batch.step(inputs)
+        self._batch.step(actions)
         outcomes = self._batch.outcomes
         flags = outcomes[_FIRST_FLAG:] != 0.0
         terminated, truncated = flags[0], flags[1]

@@ -15,7 +15,7 @@ from agents.evaluation.track_batch import make_track_batch
 from agents.policies import Policy, make_policy
 from agents.user_code import attribute_user_errors
 from duffing_env.experiment_config import Experiment
-from duffing_env.storage.kernel_spec import observation_bounds, parameter_names
+from duffing_env.storage.kernel_spec import last_input_entries, observation_bounds, parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
 from estimator.models.named_parameters import Parameters
@@ -40,12 +40,13 @@ class Evaluation:
         metrics: name of a metric (`agents.evaluation.metric_summary.METRIC_COLUMNS`) to its values (systems,).
         gain_curve: (horizon + 1, systems) gain of the log posterior at the truth over the samples [nats], including the
             loss at a jump of the truth.
-        inputs: (horizon, systems) inputs of the plant, in units of their scale, NaN after the end of an episode.
+        inputs: (horizon, systems) inputs of the plant, in units of their scale, NaN after the end of an episode;
+            (horizon, systems, inputs) of several inputs.
         outputs: (horizon, systems) outputs, likewise; (horizon, systems, sensors) for several sensors.
         scales: units of inputs and outputs, and the sampling step.
         estimator_metrics: name of another estimator to its metrics on the same inputs and outputs.
         seeds: number of training seeds.
-        limits: of input and output, in units of their scales.
+        limits: of each input and of the output, in units of their scales.
     """
 
     policy: str
@@ -56,7 +57,7 @@ class Evaluation:
     scales: Scales
     estimator_metrics: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
     seeds: int = 1
-    limits: tuple[float, float] = (np.inf, np.inf)
+    limits: tuple[tuple[float, ...], float] = ((np.inf,), np.inf)
 
     @property
     def title(self) -> str:
@@ -118,10 +119,9 @@ def run_episodes(
         policy_title(name),
         values,
         trace.gain_curve,
-        trace.inputs,
-        trace.outputs[..., 0] if trace.outputs.shape[-1] == 1 else trace.outputs,
+        *(series[..., 0] if series.shape[-1] == 1 else series for series in (trace.inputs, trace.outputs)),
         prior.scales,
-        limits=(setup.max_input, setup.max_output),
+        limits=(tuple(setup.max_input.tolist()), setup.max_output),
     )
     return PlayedEpisodes(evaluation, beliefs, truth, envs.experiment)
 
@@ -133,7 +133,9 @@ class _EpisodeTrace:
     Attributes:
         prior: belief at the start.
         initial_truth: true parameters at the start.
-        gain_curve, inputs, outputs: as of `Evaluation`; outputs (horizon, systems, sensors).
+        gain_curve: as of `Evaluation`.
+        inputs: (horizon, systems, inputs), as of `Evaluation`.
+        outputs: (horizon, systems, sensors), as of `Evaluation`.
         beliefs, truths: of each system at the end of its episode.
         ended_early: 1 where a limit ended the episode, else 0.
         jumped_at: sample at which the truth jumped, else the horizon.
@@ -159,7 +161,7 @@ class _EpisodeTrace:
             prior,
             truth,
             np.zeros((horizon + 1, systems)),
-            np.full((horizon, systems), np.nan),
+            np.full((horizon, systems, envs.experiment.model.n_inputs), np.nan),
             np.full((horizon, systems, envs.experiment.model.n_outputs), np.nan),
             [prior] * systems,
             [truth] * systems,
@@ -178,8 +180,11 @@ def _play_episodes(
     on_progress: ProgressCallback,
 ) -> _EpisodeTrace:
     """Play one episode of every row; a policy's input is held for ``hold`` samples."""
-    systems, horizon, last_input = envs.num_envs, envs.horizon, _last_input_index(envs.experiment)
-    last_outputs = slice(last_input + 1, last_input + 1 + envs.experiment.model.n_outputs)
+    systems, horizon, first = envs.num_envs, envs.horizon, _last_input_index(envs.experiment)
+    first_output = first + envs.experiment.model.n_inputs
+    last_inputs = slice(first, first_output)
+    last_outputs = slice(first_output, first_output + envs.experiment.model.n_outputs)
+    max_inputs = envs.experiment.max_inputs
     first_parameter = parameter_names(envs.experiment.truth_model)[0]
     observations, _ = envs.reset(seed=seed)
     trace = _EpisodeTrace.of(envs, systems)
@@ -201,7 +206,7 @@ def _play_episodes(
         trace.gain_curve[t + 1] = trace.gain_curve[t] + np.where(running, infos["log_posterior_gain"], 0.0)
         has_jumped = getattr(envs.truth, first_parameter) != initial_value
         trace.jumped_at[running & (trace.jumped_at == horizon) & has_jumped] = t
-        trace.inputs[t, running] = envs.max_input * observations[running, last_input]
+        trace.inputs[t, running] = max_inputs * observations[running, last_inputs]
         trace.outputs[t, running] = envs.experiment.max_output * observations[running, last_outputs]
         finished = running & (terminated | truncated)
         for row in np.flatnonzero(finished):
@@ -228,12 +233,12 @@ def _add_jump_losses(trace: _EpisodeTrace, truth: Parameters) -> None:
 
 
 def _last_input_index(experiment: Experiment) -> int:
-    """Index of the last input in an observation; the last outputs follow it."""
+    """Index of the first last input in an observation; the further ones and the last outputs follow it."""
     if experiment.observation == "history":
-        return (experiment.history - 1) * (1 + experiment.model.n_outputs)
+        return (experiment.history - 1) * (experiment.model.n_inputs + experiment.model.n_outputs)
     if callable(experiment.observation):
         raise ValueError(
             "observation must not be a function where policies are compared, which need the last input and outputs; "
             "take 'posterior', 'history' or 'privileged'"
         )
-    return list(observation_bounds(experiment.model)).index("last_input")
+    return list(observation_bounds(experiment.model)).index(last_input_entries(experiment.model)[0])

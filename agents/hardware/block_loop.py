@@ -22,6 +22,7 @@ from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import Policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
+from duffing_env.input_options import check_single_input
 from estimator.support.array_types import FloatArray
 
 
@@ -59,7 +60,7 @@ class SignalBlockDesigner:
         u, empty_observation = np.empty(samples), np.zeros(1)
         for k in range(samples):
             action, self._state = self._policy.predict(empty_observation, self._state)
-            u[k] = self._env_view.max_input * action[0]
+            u[k] = self._env_view.max_inputs[0] * action[0]
         scale, probability = futures.safe_scale(u, bound)
         return ScaledBlock(scale * u, scale, probability)
 
@@ -84,8 +85,13 @@ def block_designer(policy: Policy, env_view: EnvView) -> BlockDesigner:
     """The designer of a policy's blocks.
 
     Raises:
-        ValueError: for a policy that responds to every sample.
+        ValueError: for a policy that responds to every sample, or several inputs.
     """
+    check_single_input(
+        "signals and blocks on a rig, whose safety is simulated with a disturbance of one input",
+        env_view.experiment.model,
+        "pass a policy of your own that chooses each sample, module:name",
+    )
     if isinstance(policy, SignalPolicy):
         return SignalBlockDesigner(policy, env_view)
     if isinstance(policy, EfePlanner):
@@ -124,7 +130,8 @@ def design_safe_block(
             f"even without input the output would leave its range with probability {probability:.2g}, and at most "
             f"{bound:.2g} is allowed; give a narrower guess or a wider range",
         )
-    return np.clip(u, -env_view.max_input, env_view.max_input) * estimator.scales.input
+    max_input = env_view.max_inputs[0]
+    return np.clip(u, -max_input, max_input) * estimator.scales.input
 
 
 class BlockLoop:

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from duffing_env.env_common import action_space
 from duffing_env.storage.kernel_spec import observation_bounds
 from duffing_env.tracks.external_plant_env import RigPlantExperiment
 from estimator.belief import Belief
@@ -26,7 +27,9 @@ class EnvView:
 
     Attributes:
         experiment: the experiment of ``Rig-v0`` around a plant.
-        max_input: largest input, in the belief's scale.
+        max_input: largest input, in the belief's scale; of several inputs by their names.
+        max_inputs: (inputs,) the same as an array.
+        action_space: of ``Rig-v0``.
         horizon: number of samples of the run.
         belief: the belief now; the run sets it.
         last_observations: (1, entries) the last result of `observation`.
@@ -35,9 +38,10 @@ class EnvView:
     def __init__(self, rig: Rig, prior: Belief, horizon: int) -> None:
         # The estimator takes the delay into account: a policy gets the belief at the time when its input acts.
         self.experiment = RigPlantExperiment(rig=replace(rig, delay=0), prior=prior, horizon=horizon)
-        self.max_input, self.horizon = float(self.experiment.max_input), horizon
+        self.max_input, self.max_inputs, self.horizon = self.experiment.max_input, self.experiment.max_inputs, horizon
+        self.action_space = action_space(self.experiment)
         self.belief = prior
-        self.last_observations = self.observation(0.0, 0.0, 0)[None]
+        self.last_observations = self.observation(np.zeros(len(self.max_inputs)), 0.0, 0)[None]
 
     @property
     def unwrapped(self) -> EnvView:
@@ -49,11 +53,11 @@ class EnvView:
         """The belief now as the flat record (1, size) of `estimator.Belief`."""
         return self.belief.record[None].copy()
 
-    def observation(self, u: float, y: float, elapsed: int) -> npt.NDArray[np.float32]:
+    def observation(self, u: float | FloatArray, y: float, elapsed: int) -> npt.NDArray[np.float32]:
         """The observation (entries,) of ``Rig-v0``, after an input and an output in the belief's scales.
 
         Args:
-            u: the last input.
+            u: the last input, or (inputs,) inputs.
             y: the last output; NaN, a missing output, is replaced by the model's prediction.
             elapsed: samples since the start of the run.
         """
@@ -72,7 +76,8 @@ class EnvView:
             [cov[i, j] / (stds[i] * stds[j]) for i, j in pairs],
             log_noise_ratios,
             belief.state_mean / self.experiment.max_output,
-            [u / self.max_input, y / self.experiment.max_output],
+            u / self.max_inputs,
+            [y / self.experiment.max_output],
             [max(0.0, 1.0 - elapsed / self.horizon), 1.0],
         ])  # fmt: skip
         low, high = np.array(list(observation_bounds(belief.model).values())).T

@@ -25,6 +25,7 @@ from agents.policies import make_policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
+from duffing_env.input_options import check_single_input
 from estimator.belief import Belief, covariance_indices
 from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD, RECOMMENDED_SAMPLES_PER_PERIOD
 from estimator.inference.free_run import free_run
@@ -106,6 +107,7 @@ def design_experiment(
     check_integer("seed", seed, MAX_SEED, 0)
     rig = Rig.from_any(rig)
     belief = rig_prior(rig) if prior is None else prior
+    check_single_input("the design of an experiment", belief.model, "play a signal such as prbs in an environment")
     env_view = EnvView(rig, belief, int(samples))
     rng = np.random.default_rng(seed)
     view, limit = ModelView.of(env_view.experiment), float(env_view.experiment.max_output)
@@ -130,7 +132,8 @@ def design_experiment(
             f"probability {block.exit_probability:.2g}, and at most {bound:.2g} is allowed; give a narrower guess or a "
             "wider range"
         )
-    u = np.clip(block.inputs, -env_view.max_input, env_view.max_input)
+    max_input = env_view.max_inputs[0]
+    u = np.clip(block.inputs, -max_input, max_input)
     log_det_gain, covs = expected_information(view, systems, limit, u)
     if not (np.isfinite(log_det_gain) and np.isfinite(covs).all()):
         raise ValueError(
@@ -169,7 +172,7 @@ def _optimised_block(
     record = _belief_record_at_rest(env_view.belief)
     starting_inputs = initial_guesses(planner.settings, record, samples, seed, n_noise_starts)
     return ScaledBlock(
-        *optimise_block(view, systems, futures, starting_inputs, env_view.max_input, bound, tell=on_progress)
+        *optimise_block(view, systems, futures, starting_inputs, float(env_view.max_inputs[0]), bound, tell=on_progress)
     )
 
 
@@ -280,7 +283,7 @@ def _roll_out_policy(
             action, state = policy.predict(observation, state, episode_start, deterministic=True)
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, _ = env.step(action)
-        u[t] = env_view.max_input * float(action[0])
+        u[t] = env_view.max_inputs[0] * float(action[0])
         if terminated or truncated:
             break
     scale, probability = futures.safe_scale(u, bound)

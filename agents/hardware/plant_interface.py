@@ -11,6 +11,9 @@ from agents.user_code import load_object
 from estimator.rigs.rig import Rig
 from estimator.support.array_types import FloatArray
 
+#: The value of a rig's only input, or (inputs,) values of several.
+InputValue = float | FloatArray
+
 
 class HardwarePlant(Protocol):
     """A plant, in the rig's units. It begins disarmed, with its input at zero; any exception ends the run.
@@ -27,8 +30,11 @@ class HardwarePlant(Protocol):
     def arm(self, watchdog: float | None) -> object:
         """Let inputs through from now on; a plant with a watchdog zeroes its input after ``watchdog`` s of silence."""
 
-    def apply(self, u: float) -> float:
-        """Apply an input from now until the next one; returns the input after the plant's own clamps."""
+    def apply(self, u: Any) -> Any:
+        """Apply an input from now until the next one; returns the input after the plant's own clamps.
+
+        It is a float; of a rig with several inputs an array (inputs,), which is applied at once.
+        """
         ...
 
     def read(self) -> float:

@@ -9,8 +9,11 @@ import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
+from agents.hardware.plant_interface import InputValue
 from agents.output_paths import check_output_folder
 from agents.result_files import package_versions, replace_non_finite
 from estimator.identification.data.column_units import name_with_unit
@@ -24,9 +27,10 @@ class SampleRow(NamedTuple):
     Attributes:
         sample: number of the tick.
         time: of the tick [s].
-        u: mean of the applied input until the next tick; its column has the name that the rig gives it.
+        u: mean of the applied input until the next tick; its column has the name that the rig gives it. Several inputs
+            (inputs,) have a column each.
         y: output at the tick; its column has the name that the rig gives it.
-        commanded: the input that the policy chose, before clamps.
+        commanded: the input that the policy chose, before clamps; several have the columns ``commanded_<input>``.
         block: number of the block; 0 in a run by samples.
         late: 1 where the tick was missed, or its output or input was late, else 0.
         clock: time when the row was complete [s].
@@ -35,9 +39,9 @@ class SampleRow(NamedTuple):
 
     sample: int
     time: float
-    u: float | None
+    u: InputValue | None
     y: float | None
-    commanded: float | None
+    commanded: InputValue | None
     block: int
     late: int
     clock: float
@@ -62,7 +66,7 @@ class Recording:
     Args:
         folder: a new folder, or an empty one.
         manifest: entries of manifest.json.
-        rig: names the columns of input and output.
+        rig: names the columns of inputs and output.
 
     Raises:
         ValueError: for a folder that is not empty, or that another process writes to.
@@ -92,8 +96,13 @@ class Recording:
             "ended": None,
         }
         self._write_manifest()
-        names = {n: name_with_unit(one.column or n, one.unit) for n, one in (("u", rig.input), ("y", rig.output))}
-        append_atomically(self.samples_path, ",".join(names.get(name, name) for name in SampleRow._fields) + "\n")
+        inputs = {name: name_with_unit(one.column or name, one.unit) for name, one in rig.inputs.items()}
+        self._n_inputs = len(inputs)
+        commanded = ["commanded"] if self._n_inputs == 1 else [f"commanded_{name}" for name in inputs]
+        columns = {"u": [*inputs.values()], "y": [name_with_unit(rig.output.column or "y", rig.output.unit)]}
+        columns["commanded"] = commanded
+        names = [name for field in SampleRow._fields for name in columns.get(field, [field])]
+        append_atomically(self.samples_path, ",".join(names) + "\n")
 
     @property
     def samples_path(self) -> Path:
@@ -102,10 +111,21 @@ class Recording:
 
     def write_rows(self, rows: Sequence[SampleRow]) -> None:
         """Append rows to samples.csv."""
-        lines = [
-            ",".join("" if value is None or not math.isfinite(value) else repr(value) for value in row) for row in rows
-        ]
+        lines = []
+        for row in rows:
+            values = row if self._n_inputs == 1 else self._by_channel(row)
+            lines.append(",".join("" if v is None or not math.isfinite(v) else repr(v) for v in values))
         append_atomically(self.samples_path, "\n".join(lines) + "\n")
+
+    def _by_channel(self, row: SampleRow) -> list[Any]:
+        """The values of a row of several inputs, one for each column."""
+        values: list[Any] = []
+        for field, value in zip(SampleRow._fields, row, strict=True):
+            if field in ("u", "commanded"):
+                values += [None] * self._n_inputs if value is None else np.asarray(value).tolist()
+            else:
+                values.append(value)
+        return values
 
     def log_event(self, event: str, **details: object) -> None:
         """Append an event to events.jsonl (`EventLog`)."""

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from agents.planning.model_probe import believed_resonance, probe_dynamics
+from agents.planning.model_probe import believed_resonance, only_input_rows, probe_dynamics
 from agents.planning.open_loop.posterior_samples import SystemDraws, draw_from_estimator
 from estimator.belief import Belief, covariance_indices
 from estimator.compilation.array_operations import copy as copy_numbers
@@ -57,7 +57,7 @@ def _compile_free_response(model: Model) -> _FreeResponse:
     """The compiled free response of a model."""
     kernels = compile_noise_free_step(model)
     layout, step, n = kernels.layout, kernels.step, model.n_states
-    size, n_variables, input_index = len(layout), len(model.names), layout["INPUT"]
+    size, n_variables, input_index = len(layout), len(model.names), layout[only_input_rows(model)[0]]
 
     @kernel(variant=f"{model.name}_{model.digest}")
     def free_response(systems, u, lengths):
@@ -136,6 +136,8 @@ class RunEstimator:
     def update(self, u: npt.ArrayLike, y: npt.ArrayLike) -> None:
         """Update by outputs (N,) at ticks, NaN where one is missing, each with the input of the tick before it.
 
+        Of several inputs u is (N, inputs).
+
         After a pause the estimator starts from each Gaussian of the mixture; the one with the best evidence is kept.
 
         Raises:
@@ -195,10 +197,10 @@ class RunEstimator:
         """
         return self._systems_after_pause or draw_from_estimator(self.online, rng)
 
-    def predict_ahead(self, u: float) -> Belief:
+    def predict_ahead(self, u: float | FloatArray) -> Belief:
         """The belief when the next input begins to act, if the present input is u; the estimator does not change."""
         copied = copy.copy(self.online)  # `run` changes no array that the copy shares
-        inputs = np.zeros(1 + self.delay)
+        inputs = np.zeros((1 + self.delay, *np.shape(u)))
         inputs[0] = u
         copied.run(inputs, np.full(len(inputs), np.nan), missing=True)
         return copied.belief

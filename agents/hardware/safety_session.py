@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from agents.hardware.plant_interface import HardwarePlant
+from agents.hardware.plant_interface import HardwarePlant, InputValue
 from agents.hardware.recording import EventLog
 from agents.interruption import InterruptHandler
 from duffing_env.tracks.external_plant_env import as_number
@@ -57,12 +57,13 @@ class Session:
 
     Args:
         plant: of the rig.
-        rig: with a limit of the input and a range of the output.
+        rig: with a limit of each input and a range of the output.
         log_event: called at each event.
         watchdog: seconds of silence after which the plant zeroes its input by itself; None: it has no watchdog.
         max_stale: number of outputs in a row, missing, late or equal to the one before, that stops the run; 0: none.
 
     Attributes:
+        no_input: the input that is zero: 0.0, or an array of zeros for several inputs.
         zeroing_error: after the exit, what failed of zeroing and disarming, which is printed on stderr, too; empty
             where nothing failed.
 
@@ -75,7 +76,10 @@ class Session:
     ) -> None:
         check_safety_settings(rig, plant, watchdog)
         self.plant, self.watchdog, self.max_stale = plant, watchdog, max_stale
-        self.input_limit, self.output_range = float(rig.input.limit or 0.0), float(rig.output.range or 0.0)
+        limits = [float(channel.limit or 0.0) for channel in rig.inputs.values()]
+        self.input_limit: InputValue = limits[0] if len(limits) == 1 else np.array(limits)
+        self.no_input: InputValue = 0.0 if len(limits) == 1 else np.zeros(len(limits))
+        self.output_range = float(rig.output.range or 0.0)
         self.is_armed, self.zeroing_error = False, ""
         self._log_event, self._last_output, self._consecutive_stale = log_event, math.nan, 0
         self._interrupt_handler = InterruptHandler()
@@ -130,25 +134,43 @@ class Session:
         self.is_armed = False
 
     def clamp(self, u: npt.ArrayLike) -> FloatArray:
-        """Clamp an input, or several, to the limit.
+        """Clamp an input, or several samples of it, to the limit; of several inputs each to its own.
 
         Raises:
-            ValueError: for an input that is not finite.
+            ValueError: for an input that is not finite, or not a number for each input.
         """
         if not np.isfinite(u).all():
             raise ValueError(f"input must be finite, but is {u!r:.80}; the policy is broken")
+        if np.ndim(self.input_limit) and np.shape(u)[-1:] != np.shape(self.input_limit):
+            raise ValueError(
+                f"input must be {np.size(self.input_limit)} numbers, one for each input, but is {u!r:.80}; the policy "
+                "is broken"
+            )
         clamped: FloatArray = np.clip(u, -self.input_limit, self.input_limit)
         return clamped
 
-    def apply(self, u: float) -> float:
-        """Apply an input, clamped; returns the input that the plant applied.
+    def apply(self, u: InputValue) -> InputValue:
+        """Apply an input, clamped; returns the input that the plant applied. Several inputs are arrays (inputs,).
 
         Raises:
-            SafetyStop: if the plant applied more than the limit, raised an exception, or returned no number.
+            SafetyStop: if the plant applied more than the limit, raised an exception, or returned no number for each
+                input.
         """
         self._interrupt_handler.raise_if_interrupted()
-        value = float(self.clamp(u))
-        applied = self._call_for_number("apply", value)
+        clamped = self.clamp(u)
+        applied: InputValue
+        if clamped.ndim:
+            answer = self._call_plant("apply", self.plant.apply, clamped)
+            try:
+                applied = np.array(answer, dtype=np.float64)
+            except (TypeError, ValueError):
+                applied = np.empty(0)
+            if applied.shape != clamped.shape:
+                raise SafetyStop(
+                    StopReason.PLANT, f"apply must give {len(clamped)} numbers, but gave {short_repr(answer)}"
+                )
+        else:
+            applied = self._call_for_number("apply", float(clamped))
         self._check_applied(np.array([applied]))
         return applied
 
@@ -204,10 +226,12 @@ class Session:
                 raise SafetyStop(StopReason.STALE, f"{self._consecutive_stale} outputs in a row were missing{again}")
 
     def _check_applied(self, applied: FloatArray) -> None:
-        if not (np.abs(applied) <= self.input_limit * (1 + _INPUT_TOLERANCE)).all():
-            raise SafetyStop(
-                StopReason.INPUT, f"the plant applied {np.abs(applied).max():.6g}, beyond ±{self.input_limit:.6g}"
-            )
+        """Check inputs (N,), or (N, inputs) of several."""
+        is_within = np.abs(applied) <= self.input_limit * (1 + _INPUT_TOLERANCE)
+        if not is_within.all():
+            worst = np.abs(np.where(is_within, 0.0, applied)).max()
+            limit = np.broadcast_to(self.input_limit, applied.shape)[~is_within].flat[0]
+            raise SafetyStop(StopReason.INPUT, f"the plant applied {worst:.6g}, beyond ±{limit:.6g}")
 
     def _call_for_number(self, name: str, *arguments: Any) -> float:
         answer = self._call_plant(name, getattr(self.plant, name), *arguments)
@@ -229,9 +253,9 @@ def check_safety_settings(rig: Rig, plant: HardwarePlant, watchdog: float | None
     Raises:
         ValueError: for a rig without limit or range, or a watchdog time for a plant without watchdog.
     """
-    for channel, name in ((rig.input, "limit"), (rig.output, "range")):
+    channels = [(channel, "limit", input_key(rig, name)) for name, channel in rig.inputs.items()]
+    for channel, name, side in (*channels, (rig.output, "range", "output")):
         if getattr(channel, name) is None:
-            side = "input" if name == "limit" else "output"
             raise ValueError(f"rig must have a {name} of the {side} for a run, but has none; add {side}.{name}")
     if watchdog is not None and not plant.has_watchdog:
         raise ValueError(

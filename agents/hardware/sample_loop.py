@@ -10,6 +10,7 @@ import numpy as np
 
 from agents.hardware.clock import Clock
 from agents.hardware.env_view import EnvView
+from agents.hardware.plant_interface import InputValue
 from agents.hardware.recording import Recording, SampleRow
 from agents.hardware.run_estimator import RunEstimator
 from agents.hardware.safety_session import SafetyStop, Session, StopReason
@@ -26,20 +27,21 @@ _LATE_REMEDY = "play blocks (--block 64), or take a longer step"
 
 
 #: ``next_input(k, u, y)``: the input of tick k [rig's unit], given the present input u and the last output y.
-InputFunction = Callable[[int, float, float], float]
+InputFunction = Callable[[int, InputValue, float], InputValue]
 
 
 def inputs_from_policy(policy: Policy, env_view: EnvView, run_estimator: RunEstimator) -> InputFunction:
     """Inputs that a policy chooses one tick ahead, from the belief at the time when the input will act."""
     state: Any = None
 
-    def next_input(k: int, u: float, y: float) -> float:
+    def next_input(k: int, u: InputValue, y: float) -> InputValue:
         nonlocal state
         scales = run_estimator.online.scales
         env_view.belief = run_estimator.predict_ahead(u)
         observation = env_view.observation(u / scales.input, y / scales.output, k)
         action, state = policy.predict(observation, state, deterministic=True)
-        return float(action[0]) * env_view.max_input * scales.input
+        chosen = action.astype(np.float64) * env_view.max_inputs * scales.input
+        return chosen.item() if len(chosen) == 1 else chosen
 
     return next_input
 
@@ -53,9 +55,10 @@ class SampleLoop:
     """The loop of a run by samples.
 
     At a tick the output is read, and the input that was chosen before is applied at once. Until the next tick the
-    estimator is updated, and the next input is chosen. A tick that passes meanwhile is missed: the input stays, no
-    output is read, the row is marked late, and the estimator is updated by a missing output. A late output is recorded
-    in a column of its own, and not used. Where an input acted late, its sample has the mean of the applied input.
+    estimator is updated, and the next input is chosen. Several inputs are applied together, as an array. A tick that
+    passes meanwhile is missed: the input stays, no output is read, the row is marked late, and the estimator is updated
+    by a missing output. A late output is recorded in a column of its own, and not used. Where an input acted late, its
+    sample has the mean of the applied input.
 
     Attributes:
         tick: number of the next tick.
@@ -72,7 +75,7 @@ class SampleLoop:
         self.tick = self.late_ticks = self.lost_outputs = 0
         self._consecutive_lost = 0
         self._call_durations = 0.0, 0.0
-        self._applied_input = self._last_mean_input = 0.0
+        self._applied_input = self._last_mean_input = session.no_input
         self._last_output = math.nan
 
     def listen(self, samples: int) -> None:
@@ -84,7 +87,7 @@ class SampleLoop:
         for _ in range(samples):
             self._take_missed_ticks(late=True)
             self._clock.wait(self._next_tick_time)
-            self._take_sample(0.0, apply=False)
+            self._take_sample(self._session.no_input, apply=False)
         self._check_lost_outputs(samples)
 
     def skip_elapsed_ticks(self) -> None:
@@ -109,7 +112,7 @@ class SampleLoop:
             self._clock.wait(self._next_tick_time)
             if self._clock.now() > self._next_tick_time + MAX_TICK_DELAY * self._step:
                 continue  # woken too late: this tick is a missed one
-            self._take_sample(commanded if k < samples else 0.0)
+            self._take_sample(commanded if k < samples else self._session.no_input)
             on_progress(min(self.tick - start, samples))
             if self.tick - start < samples:
                 commanded = next_input(self.tick - start, self._last_mean_input, self._last_output)
@@ -137,13 +140,13 @@ class SampleLoop:
         self._record_and_update([self._applied_input] * missed, [math.nan] * missed, None, late, lost)
         return True
 
-    def _take_sample(self, commanded: float, apply: bool = True) -> None:
+    def _take_sample(self, commanded: InputValue, apply: bool = True) -> None:
         """Read the output and apply the input, and measure when both happened."""
         due, now = self._next_tick_time, self._clock.now
         read_start = now()
         y = self._session.read()
         read_end = now()
-        applied = self._session.apply(commanded) if apply else 0.0
+        applied = self._session.apply(commanded) if apply else self._session.no_input
         apply_end = now()
         self._call_durations = read_end - read_start, apply_end - read_end
         read_time = (read_start + read_end) / 2
@@ -164,9 +167,9 @@ class SampleLoop:
 
     def _record_and_update(
         self,
-        u: list[float],
+        u: list[InputValue],
         y: list[float],
-        commanded: float | None,
+        commanded: InputValue | None,
         late: bool,
         lost: int,
         read_output: float | None = None,

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.planning.d_optimality import half_log_det, invert_from_cholesky
+from agents.planning.model_probe import only_input_rows
 from agents.planning.plan_objective import MAX_MARGIN_FRACTION
 from estimator.compilation.simd import LANES, jit_closure, lanewise
-from estimator.engine.expected_update import DIVERGED_SCORE, compile_expected_update, input_history_rows
+from estimator.engine.expected_update import DIVERGED_SCORE, compile_expected_update
 from estimator.engine.storage_layout import belief_rows
 from estimator.models.model import Model
 
@@ -110,7 +111,7 @@ def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> Belie
     n_states = model.n_states
     # A block holds a record's states and covariances, and not the means of the coefficients, which are the same in all.
     n_loaded = n_states + sum(name.startswith("P_") for name in names)
-    inputs = tuple(place[name] * LANES for name in input_history_rows(model, degree, lag))
+    inputs = tuple(place[name] * LANES for name in only_input_rows(model) if name in place)
     u, cost, score = inputs[0], place["COST"] * LANES, place["SCORE"] * LANES
     started_row, margin_row, excess_row, variance_row = (
         place[name] * LANES for name in ("HAS_PENDING", "MARGIN", "NEAR", "S_PRED")
@@ -123,8 +124,9 @@ def compile_belief_rollout(model: Model, degree: int = 0, lag: int = 0) -> Belie
         "sensor_variance accumulated_noise limit margin hard_margin input_weight goal goal_weight amplitude "
         "recoverable_step"
     )
-    stage_rows = {**place, "INPUT": u // LANES}
-    stage_cost = lanewise(stage_rows, "COST MARGIN NEAR", uniform=uniform)(_stage_cost)
+    stage_cost = lanewise({**place, "INPUT": place[only_input_rows(model)[0]]}, "COST MARGIN NEAR", uniform=uniform)(
+        _stage_cost
+    )
     net_information = lanewise(place, "SCORE")(_net_information)
     compile_inner = jit_closure(f"{model.name}_{model.digest}_{degree}_{lag}")
 

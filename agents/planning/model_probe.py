@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.storage.kernel_spec import observation_bounds
+from duffing_env.input_options import check_single_input
+from duffing_env.storage.kernel_spec import last_input_entries, observation_bounds
 from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
 from estimator.compilation.simd import kernel
@@ -61,7 +62,7 @@ class ObservationLayout(NamedTuple):
         correlation: of their correlations.
         noise: of the logarithms of the precisions: process noise, then each sensor's.
         state: of the states.
-        last_input: of the last input.
+        last_input: of the last input, or the first of several.
         last_output: of the last outputs.
         time_left: of the time left.
         budget_left: of the energy left.
@@ -86,9 +87,19 @@ def observation_layout(model: Model) -> ObservationLayout:
     at = {name: i for i, name in enumerate(observation_bounds(model))}
     k, state, sensor = model.n_coefficients, next(iter(model.states)), next(iter(model.outputs))
     return ObservationLayout(
-        0, k, 2 * k, at["log_gamma"], at[f"state_{state}"], at["last_input"], at[f"last_{sensor}"], at["time_left"],
-        at["budget_left"], len(at),
+        0, k, 2 * k, at["log_gamma"], at[f"state_{state}"], at[last_input_entries(model)[0]], at[f"last_{sensor}"],
+        at["time_left"], at["budget_left"], len(at),
     )  # fmt: skip
+
+
+def only_input_rows(model: Model) -> tuple[str, str, str]:
+    """Rows of the newest value of a model's only input, and of the two before it (`input_history_row`).
+
+    Raises:
+        ValueError: for a model with several inputs.
+    """
+    name = check_single_input("planning", model, "choose a signal such as prbs")
+    return input_history_row(name, 0), input_history_row(name, 1), input_history_row(name, 2)
 
 
 class LocalDynamics(NamedTuple):
@@ -119,8 +130,7 @@ def _compile_local_dynamics(model: Model) -> Any:
         free_response.linearise,
         free_response.regressors,
     )
-    n, k, size = model.n_states, model.n_coefficients, len(at)
-    u = at[input_history_row(next(iter(model.inputs)), 0)]
+    n, k, size, u = model.n_states, model.n_coefficients, len(at), at[only_input_rows(model)[0]]
     now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
     state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
     linear, first = at[f"A_{state}_{state}"], at[f"REGRESSOR_{coefficient}"]

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from agents.planning.model_probe import ModelView, is_on_rig
+from agents.planning.model_probe import ModelView, is_on_rig, only_input_rows
 from estimator.compilation.array_operations import copy, fill
 from estimator.compilation.simd import kernel
 from estimator.engine.noise_free_step import compile_noise_free_step
-from estimator.engine.storage_layout import input_history_row
 from estimator.support.array_types import FloatArray
 
 #: Samples of the motion by which a system is measured.
@@ -71,7 +70,7 @@ def _compile_pumped_swing(view: ModelView) -> Any:
         free_response.step,
     )
     n, k, size = view.model.n_states, view.model.n_coefficients, len(at)
-    u, shown, velocity = at[input_history_row(next(iter(view.model.inputs)), 0)], at["Y_PRED"], at["VELOCITY"]
+    u, shown, velocity = at[only_input_rows(view.model)[0]], at["Y_PRED"], at["VELOCITY"]
     phi = at[f"PHI_{next(iter(view.model.coefficients))}"]
     # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states = (view.model.rates or ("",))[0], list(view.model.states)
@@ -171,7 +170,7 @@ def recoverable_step(experiment: Any, view: ModelView, time_scales: TimeScales) 
         view.degree
         or view.lag
         or time_scales.hold_samples > 1
-        or np.isfinite(setup.max_slew)
+        or np.isfinite(setup.max_slew).any()
         or np.isfinite(setup.budget)
     )
     return (

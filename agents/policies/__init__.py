@@ -40,7 +40,7 @@ class Policy(Protocol):
             deterministic: Whether to take a stochastic policy's mode instead of a sample.
 
         Returns:
-            The actions in [-1, 1], float32 of shape `(n, 1)`, or `(1,)` for one environment; and
+            The actions in [-1, 1], float32 of shape `(n, inputs)`, or `(inputs,)` for one environment; and
             the state for the next call.
         """
         ...
@@ -81,7 +81,7 @@ def make_policy(name: Any, env: Env | VectorEnv | None = None, *, seed: int = 0,
             trained policy (`runs/...`), or `module:name` of a thing of your own; or that thing itself. It may be
             an object that has `predict`, such as a model of Stable-Baselines3, whose `VecNormalize` is not
             forgotten; a class, which is called with those of `env`, `seed` and the options that it takes by
-            name; or a function of observations (n, features) that gives actions (n, 1), such as a module of torch.
+            name; or a function of observations (n, features) that gives actions (n, inputs), such as a module of torch.
         env: The environment it is for, single or vector, wrapped or not, or a `VecEnv` of Stable-Baselines3 around
             it: it gives the amplitude limit, the episode's length and, where it replays a record, the recorded
             input. Planners read its belief and model, do not play without it, and refuse observations

@@ -46,7 +46,7 @@ def custom_policy(policy: Any, env: Any, seed: int, options: dict[str, Any]) -> 
         return _NormalisedModel(policy, vec_normalize)
     if not callable(policy):
         raise ValueError(f"policy must have predict, or be a function of observations, but is {policy!r:.60}")
-    return _FunctionPolicy(policy)
+    return _FunctionPolicy(policy, env)
 
 
 def unwrap_vec_env(env: Any, is_signal: bool) -> Any:
@@ -144,10 +144,15 @@ class _NormalisedModel:
 
 
 class _FunctionPolicy:
-    """A function of observations (n, features) that gives actions (n, 1) or (n,): NumPy's, or a module of torch."""
+    """A function of observations (n, features) that gives actions (n, inputs): NumPy's, or a module of torch.
 
-    def __init__(self, function: Any) -> None:
+    For one input it may give (n,). The number of inputs is the environment's, or 1 without one.
+    """
+
+    def __init__(self, function: Any, env: Any) -> None:
         self._function = function
+        space = getattr(env, "single_action_space", getattr(env, "action_space", None))
+        self._n_inputs = 1 if getattr(space, "shape", None) in (None, ()) else space.shape[-1]  # type: ignore[union-attr]
         torch = sys.modules.get("torch")
         self._is_module = torch is not None and isinstance(function, torch.nn.Module)
 
@@ -171,8 +176,7 @@ class _FunctionPolicy:
         if hasattr(chosen, "detach"):
             chosen = chosen.detach().cpu().numpy()
         actions = np.asarray(chosen, dtype=np.float32)
-        if actions.size != len(rows) or not np.isfinite(actions).all():
-            raise ValueError(
-                f"policy must give a finite action for each of {len(rows)} observations, but gave {actions!r:.200}"
-            )
-        return np.clip(actions, -1.0, 1.0).reshape(*seen.shape[:-1], 1), state
+        if actions.size != len(rows) * self._n_inputs or not np.isfinite(actions).all():
+            each = "a finite action" if self._n_inputs == 1 else f"{self._n_inputs} finite inputs"
+            raise ValueError(f"policy must give {each} for each of {len(rows)} observations, but gave {actions!r:.200}")
+        return np.clip(actions, -1.0, 1.0).reshape(*seen.shape[:-1], self._n_inputs), state

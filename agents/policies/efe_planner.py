@@ -53,6 +53,7 @@ from agents.planning.plan_objective import DEFAULT_RISK, PlanObjective, margin_p
 from agents.planning.receding_horizon import PlanArrays, PlanSettings, compile_receding_horizon
 from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales, recoverable_step
 from agents.predict_argument_checks import check_batch_size, check_last_observation, episode_starts
+from duffing_env.input_options import check_single_input
 from estimator.engine.noise_free_step import with_coarse_substeps
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
 from estimator.support.array_types import FloatArray
@@ -133,9 +134,10 @@ class EfePlanner:
         objective: of plans, for the whole episode.
 
     Raises:
-        ValueError: naming the argument, if there is no environment, it replays a record, holds its actions for several
-            samples, a number is out of range, a goal has no ``goal_std``, a plan of the whole episode is asked to have
-            a goal or cost, or where the energy of a long episode is limited and no horizon is given.
+        ValueError: naming the argument, if there is no environment, it replays a record, has several inputs, holds its
+            actions for several samples, a number is out of range, a goal has no ``goal_std``, a plan of the whole
+            episode is asked to have a goal or cost, or where the energy of a long episode is limited and no horizon is
+            given.
     """
 
     def __init__(
@@ -160,6 +162,7 @@ class EfePlanner:
         check_number("risk", risk, MIN_MAGNITUDE, 1 - MIN_MAGNITUDE)
         check_number("input_cost", input_cost, 0)
         experiment = env.experiment
+        check_single_input("the planner", experiment.model, "choose a signal such as prbs")
         if experiment.hold != 1:
             raise ValueError(
                 f"env must take an action for every sample, as plans do, but its hold is {experiment.hold}; "
@@ -197,10 +200,11 @@ class EfePlanner:
         self.seed = seed
         self.horizon, self.rounds = int(horizon), int(rounds)
         means = experiment.prior_belief.coefficients_mean
-        time_scales = probe_time_scales(self.model_view, means, setup.max_input, setup.max_output)
+        max_input = float(setup.max_input[0])
+        time_scales = probe_time_scales(self.model_view, means, max_input, setup.max_output)
         self.objective = PlanObjective(
-            amplitude=setup.max_input,
-            slew=setup.max_slew,
+            amplitude=max_input,
+            slew=float(setup.max_slew[0]),
             limit=planning_limit(experiment, time_scales.scales),
             margin=margin_profile(env.horizon, risk) * (1 + max(self.model_view.degree, self.model_view.lag)),
             walk=setup.walk_variances.copy(),

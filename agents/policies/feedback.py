@@ -24,6 +24,7 @@ from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
 from agents.predict_argument_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.input_options import check_single_input
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import to_float_array
 
@@ -120,7 +121,7 @@ class FeedbackPolicy:
             self._amplitude(*motion) > BRAKE_FRACTION, -np.sign(motion[1]), self._sign_law(motion[1], phase)
         )
         # An input of one magnitude has that magnitude as its RMS.
-        size = self.limits.to_actions(np.array([self.limits.max_input])).item()
+        size = self.limits.to_actions(np.array(self.limits.max_inputs)).item()
         actions = (size * signs).astype(np.float32).reshape(*np.shape(observation)[:-1], 1)
         return actions, (phase + self.limits.hold * motion[2]) % 1.0
 
@@ -157,10 +158,14 @@ def make_feedback(sign_law: SignLaw, env: Any, seed: int) -> FeedbackPolicy:
     """A policy with feedback for an unwrapped environment (or None: the defaults); the seed has no effect.
 
     Raises:
-        ValueError: `env` is not one of duffing_env.
+        ValueError: `env` is not one of duffing_env, or has several inputs.
     """
     limits, _ = input_limits_of(env)
-    return FeedbackPolicy(sign_law, limits, SimulatedExperiment() if env is None else env.experiment)
+    experiment = SimulatedExperiment() if env is None else env.experiment
+    check_single_input(
+        "a feedback law, which pushes along one velocity", experiment.model, "choose a signal such as prbs"
+    )
+    return FeedbackPolicy(sign_law, limits, experiment)
 
 
 FEEDBACK: dict[str, Callable[[Any, int], FeedbackPolicy]] = {

@@ -1,10 +1,12 @@
 """Open-loop policies: they play excitation signals, and do not use the observation.
 
 `SignalPolicy` plays a `SignalDraw` of `agents.policies.excitations` through Stable-Baselines3's `predict`, one signal
-for each environment of a batch. `make_signal` fits an excitation to an environment: to its amplitude limit, to the
-length of its episodes, and to its input budget where it has one. `agents.policies.make_policy` calls it by name.
+for each environment of a batch, and of several inputs an independent one for each. `make_signal` fits an excitation to
+an environment: to its amplitude limits, to the length of its episodes, and to its input budget where it has one.
+`agents.policies.make_policy` calls it by name.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -26,7 +28,7 @@ from estimator.support.argument_checks import (
     to_float_array,
 )
 
-#: Number of actions played, shape (n,), and actions, shape (n, actions of a draw), of each environment's signal.
+#: Number of actions played (n,), and actions (n, actions of a draw, inputs) of each environment's signal.
 SignalState = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 #: Amplitude limit without an environment [V]; the largest input of the Silverbox record is 0.149 V.
@@ -47,23 +49,24 @@ _RMS_SAFETY_FACTOR = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Limits of an input.
+    """Limits of the inputs.
 
     Attributes:
-        max_input: The input at action 1, in volts, positive.
-        max_rms: The largest root mean square over an episode, in volts, positive; None where there is none.
+        max_input: The input at action 1, in volts, positive; or for several inputs of each, in its own unit.
+        max_rms: The largest root mean square over an episode, in volts, positive; None where there is none. Of several
+            inputs it is the root of the sum of their mean squares.
         hold: Samples that an action is applied for, at least 1.
 
     Raises:
         ValueError: `max_input` or `max_rms` is not positive and finite.
     """
 
-    max_input: float = DEFAULT_MAX_INPUT
+    max_input: float | tuple[float, ...] = DEFAULT_MAX_INPUT
     max_rms: float | None = None
     hold: int = 1
 
     def __post_init__(self) -> None:
-        for name, value in (("max_input", self.max_input), ("max_rms", self.max_rms)):
+        for name, value in (*(("max_input", one) for one in self.max_inputs), ("max_rms", self.max_rms)):
             if value is not None and not (is_finite_number(value) and MIN_MAGNITUDE <= value <= 1e300):
                 raise ValueError(
                     f"{name} must be positive and finite, in volts, from {MIN_MAGNITUDE} to 1e300, but it is "
@@ -71,30 +74,40 @@ class InputLimits:
                 )
         check_integer("hold", self.hold, 10**9)
 
-    def to_actions(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Turns an input into actions within the limits. This is the one place where signals are scaled.
+    @property
+    def max_inputs(self) -> tuple[float, ...]:
+        """The input at action 1, of each input."""
+        return self.max_input if isinstance(self.max_input, tuple) else (self.max_input,)
 
-        The input is clipped at `max_input`. Where its root mean square is then above `max_rms`, it is scaled down
-        to it as a whole, because the environment would otherwise play its beginning at full size and cut the rest
-        to zero. It is never scaled up.
+    def to_actions(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turns inputs into actions within the limits. This is the one place where signals are scaled.
+
+        Each input is clipped at its `max_input`. Where the root mean square of all is then above `max_rms`, they are
+        scaled down to it as a whole, by one factor, because the environment would otherwise play their beginning at
+        full size and cut the rest to zero. They are never scaled up.
 
         Where an action is applied for several samples, the input is what a slower generator makes of it: the first of
         every `hold` samples, held. Frequencies stay what they are in Hz; those above half of the actions' rate fold.
 
         Args:
-            volts: The input of an episode, or of a part that repeats, shape `(n_samples,)`.
+            volts: The inputs of an episode, or of a part that repeats, shape `(n_samples, inputs)`, or `(n_samples,)`
+                of one input.
 
         Returns:
-            Actions in [-1, 1], shape `(ceil(n_samples / hold),)`.
+            Actions in [-1, 1], shape `(ceil(n_samples / hold), inputs)` or `(ceil(n_samples / hold),)`.
         """
-        held = np.repeat(volts[:: self.hold], self.hold)[: len(volts)]
-        actions = np.clip(held / self.max_input, -1.0, 1.0)
+        largest = np.array(self.max_inputs)
+        columns = volts.reshape(len(volts), -1)
+        held = np.repeat(columns[:: self.hold], self.hold, axis=0)[: len(columns)]
+        actions = np.clip(held / largest, -1.0, 1.0)
         if self.max_rms is not None:
-            allowed = _RMS_SAFETY_FACTOR * self.max_rms / self.max_input
-            rms = np.sqrt(np.mean(actions**2))
+            # In parts of the first input's limit.
+            allowed = _RMS_SAFETY_FACTOR * self.max_rms / largest[0]
+            rms = np.sqrt(np.mean(((largest / largest[0] * actions) ** 2).sum(axis=1)))
             if rms > allowed:
                 actions *= allowed / rms
-        return actions[:: self.hold]
+        played: NDArray[np.float64] = actions[:: self.hold]
+        return played if volts.ndim == 2 else played[:, 0]
 
 
 class SignalPolicy:
@@ -102,7 +115,7 @@ class SignalPolicy:
 
     Environment i draws from a generator of its own, the i-th child of the seed. So its k-th signal
     depends on the seed, i and k only: not on the size of the batch, nor on when the other
-    environments end their episodes.
+    environments end their episodes. Of several inputs each draws from a generator of its own, a child of that.
 
     Attributes:
         name: The name of the excitation.
@@ -112,15 +125,16 @@ class SignalPolicy:
         seed: The seed that `reset` starts from.
 
     Raises:
-        ValueError: `max_input` or `max_rms` is not positive and finite, or `n_samples` or `seed` is not a whole number.
+        ValueError: `max_input` or `max_rms` is not positive and finite, `n_samples` or `seed` is not a whole number, or
+            there is not one draw for each input.
     """
 
     def __init__(
         self,
         name: str,
-        draw: SignalDraw,
+        draw: SignalDraw | Sequence[SignalDraw],
         *,
-        max_input: float,
+        max_input: float | Sequence[float],
         max_rms: float | None = None,
         samples: int = DEFAULT_SAMPLES,
         hold: int = 1,
@@ -129,16 +143,21 @@ class SignalPolicy:
         check_integer("samples", samples, MAX_SAMPLES)
         check_integer("seed", seed, MAX_SEED, 0)
         self.name = name
-        self.limits = InputLimits(max_input, max_rms, hold)
+        self._draws = (draw,) if callable(draw) else tuple(draw)
+        self.limits = InputLimits(tuple(max_input) if isinstance(max_input, Sequence) else max_input, max_rms, hold)
+        if len(self._draws) != len(self.limits.max_inputs):
+            raise ValueError(
+                f"draw must be one for each input of max_input, {len(self.limits.max_inputs)}, but there are "
+                f"{len(self._draws)}"
+            )
         self.samples = samples
         self.actions = -(-samples // hold)
         self.seed = seed
-        self._draw = draw
         self.reset()
 
     @property
-    def max_input(self) -> float:
-        """The input at action 1, in volts."""
+    def max_input(self) -> float | tuple[float, ...]:
+        """The input at action 1, in volts, or of each of several inputs."""
         return self.limits.max_input
 
     def reset(self, seed: int | None = None) -> None:
@@ -146,7 +165,7 @@ class SignalPolicy:
         if seed is not None:
             self.seed = seed
         self._seeds = np.random.SeedSequence(self.seed)
-        self._generators: list[np.random.Generator] = []
+        self._generators: list[list[np.random.Generator]] = []
 
     def predict(
         self,
@@ -176,7 +195,7 @@ class SignalPolicy:
         rows = 1 if len(observed) == 1 else observed[0]
         if state is None:
             position = np.full(rows, self.actions)
-            signals = np.empty((rows, self.actions), dtype=np.float32)
+            signals = np.empty((rows, self.actions, len(self._draws)), dtype=np.float32)
         else:
             check_state(state, 2)
             position, signals = state
@@ -186,11 +205,15 @@ class SignalPolicy:
             position = np.where(due, 0, position)
             signals = signals.copy()
             missing = rows - len(self._generators)
-            self._generators += map(np.random.default_rng, self._seeds.spawn(max(0, missing)))
+            for seed in self._seeds.spawn(max(0, missing)):
+                seeds = [seed] if len(self._draws) == 1 else seed.spawn(len(self._draws))
+                self._generators.append([np.random.default_rng(one) for one in seeds])
             for row in np.flatnonzero(due).tolist():
-                signals[row] = self.limits.to_actions(self._draw(self._generators[row], self.samples))
-        actions = signals[np.arange(rows), position][:, np.newaxis]
-        return actions.reshape(*observed[:-1], 1), (position + 1, signals)
+                generators = zip(self._draws, self._generators[row], strict=True)
+                volts = np.stack([draw(generator, self.samples) for draw, generator in generators], axis=1)
+                signals[row] = self.limits.to_actions(volts)
+        actions = signals[np.arange(rows), position]
+        return actions.reshape(*observed[:-1], len(self._draws)), (position + 1, signals)
 
 
 def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
@@ -206,19 +229,20 @@ def make_signal(name: str, env: Any, seed: int) -> SignalPolicy:
         ValueError: `env` is not one of duffing_env.
     """
     limits, samples = input_limits_of(env)
-    draw = EXCITATIONS[name](limits.max_input)
+    draws = [EXCITATIONS[name](max_input) for max_input in limits.max_inputs]
     experiment: Any = getattr(env, "experiment", None)
     if getattr(experiment, "rig", None) is not None:
         hold = hold_for_resonance(experiment.prior_belief, samples)
         silverbox_draw = EXCITATIONS[name](DEFAULT_MAX_INPUT)
-        draw = partial(
-            _stretched_draw, draw=silverbox_draw, hold=hold, amplitude_ratio=limits.max_input / DEFAULT_MAX_INPUT
-        )
+        draws = [
+            partial(_stretched_draw, draw=silverbox_draw, hold=hold, amplitude_ratio=max_input / DEFAULT_MAX_INPUT)
+            for max_input in limits.max_inputs
+        ]
     recorded = getattr(env, "recorded_input", None)
     if recorded is not None and name.startswith("silverbox-"):
-        draw, samples = draw_recorded(recorded), len(recorded)
+        draws, samples = [draw_recorded(recorded)], len(recorded)
     return SignalPolicy(
-        name, draw, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, hold=limits.hold, seed=seed
+        name, draws, max_input=limits.max_input, max_rms=limits.max_rms, samples=samples, hold=limits.hold, seed=seed
     )
 
 
@@ -237,7 +261,7 @@ def _stretched_draw(
 
 
 def input_limits_of(env: Any) -> tuple[InputLimits, int]:
-    """The limits of the input, and the length of an episode, of an unwrapped environment (or None).
+    """The limits of the inputs, and the length of an episode, of an unwrapped environment (or None).
 
     Raises:
         ValueError: `env` is not one of duffing_env.
@@ -250,5 +274,7 @@ def input_limits_of(env: Any) -> tuple[InputLimits, int]:
             f"{type(env).__name__}; pass what gym.make, gym.make_vec or DuffingVecEnv made of its id"
         )
     experiment = getattr(env, "experiment", None)
-    limits = InputLimits(env.max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
+    max_inputs = tuple(experiment.max_inputs.tolist()) if hasattr(experiment, "max_inputs") else (env.max_input,)
+    max_input = max_inputs if len(max_inputs) > 1 else max_inputs[0]
+    limits = InputLimits(max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
     return limits, min(getattr(env, "horizon", None) or DEFAULT_SAMPLES, _MAX_DRAW_SAMPLES)

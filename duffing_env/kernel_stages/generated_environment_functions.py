@@ -7,12 +7,15 @@ from functools import cache
 from itertools import combinations
 from typing import Any
 
+from duffing_env.kernel_stages.input_limits import limited_inputs_source
 from duffing_env.rewards.log_determinant import log_det_and_density
 from duffing_env.rewards.named_rewards import REWARDS
 from duffing_env.storage.kernel_spec import (
     KernelSpec,
+    applied_row,
     block_layout,
     estimated_expressions,
+    last_input_entries,
     model_input_rows,
     noise_std_rows,
     observation_bounds,
@@ -63,7 +66,7 @@ def _environment_source(spec: KernelSpec) -> str:
     source = _true_coefficients_source(spec, loop) + _step_outcome_source(spec, loop) + _observation_source(spec)
     if spec.plant_model is not None:
         source += _plant_source(spec.plant_model, spec.degree, plant_loop)
-    source += _random_walk_source(spec.belief_model, loop)
+    source += _random_walk_source(spec.belief_model, loop) + limited_inputs_source(spec, loop)
     hook_source = REWARDS[spec.reward_hooks].hook_source if spec.reward_hooks else None
     return source + (hook_source(spec, loop) if hook_source else "")
 
@@ -109,12 +112,12 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
         after[x] = symbol(f"K_{x}")
     results = {names[x]: f"K_{x}" for x in model.states}
-    at_end = {str(name): value for name, value in inputs_at_end(model, degree).items()}
+    ends = {str(written): value for written, value in inputs_at_end(model, degree).items()}
     source = ""
     for k, (y, output_expression) in enumerate(zip(model.outputs, derivatives.outputs, strict=True)):
         noise = (v, w)[k % 2] * symbol(noises[1 + k])
         state_rows = names if model.is_continuous or k else {**names, **after}
-        value = symbolic.substitute([("", output_expression)], {**state_rows, **at_end})[0][1] + noise
+        value = symbolic.substitute([("", output_expression)], state_rows | ends)[0][1] + noise
         if model.is_continuous or k:
             source += loop(f"measure_{k}", "A sensor.", [("SHOWN", value)], {f"Y_{y}": "SHOWN"})
         else:
@@ -212,8 +215,10 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     )
     reward = sum(symbol(weight) * value for weight, value in zip(weight_names, reward_terms, strict=True))
     # In two lines: SymPy would square the factors, and the square of the input alone may overflow.
-    lines.append(("EFFORT", symbol("sqrt_input_cost") * symbol("INPUT")))
-    reward -= symbol("EFFORT") ** 2
+    cost_roots = [f"sqrt_input_cost_{i}" for i in model.inputs]
+    for i, root in zip(model.inputs, cost_roots, strict=True):
+        lines.append((f"EFFORT_{i}", symbol(root) * symbol(applied_row(i))))
+        reward -= symbol(f"EFFORT_{i}") ** 2
     first_sensor = next(iter(model.outputs))
     is_beyond_limit = is_positive(symbol("VOID")) + is_positive(
         sp.Abs(symbol(f"Y_{first_sensor}")) - symbol("max_output")
@@ -229,13 +234,16 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     }
     results |= {"INFORMATION_GAIN": "GAIN", "LOG_POSTERIOR_GAIN": "POSTERIOR", "TERMINATED": "STOPPED"}
     results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED_SAMPLES": "LATER"}
-    uniform = ("step", "max_output", "horizon", "sqrt_input_cost", *weight_names)
+    uniform = ("step", "max_output", "horizon")
     doc = "The reward of a sample, and whether it ends the episode; a broken belief pays nothing and ends it."
-    return source + loop("finish_step", doc, lines, results, *uniform)
+    source += loop("finish_step_lanes", doc, lines, results, *uniform, *cost_roots, *weight_names)
+    given = [*uniform, *(f"sqrt_input_cost[{k}]" for k in range(len(cost_roots))), *(f"weights[{k}]" for k in range(4))]
+    signature = ", ".join(["W", *uniform, "sqrt_input_cost", "weights"])
+    return source + f"@scalar_jit\ndef finish_step({signature}):\n    finish_step_lanes(W, {', '.join(given)})\n"
 
 
 def _observation_source(spec: KernelSpec) -> str:
-    """``observe(W, B, ...)``: the observation into the rows of a block ``B``, relative to the prior."""
+    """``observe(W, B, ...)``: the observation into the rows of a block ``B``, relative to the prior and the limits."""
     import sympy as sp
 
     from estimator.engine.printer_numba import print_lane_loop
@@ -257,7 +265,8 @@ def _observation_source(spec: KernelSpec) -> str:
         entries[f"log_xi_{y}"] = log(symbol(f"XI_SHAPE_{y}") / symbol(f"XI_RATE_{y}")) - symbol(f"LOG_xi_{y}")
     for x in model.states:
         entries[f"state_{x}"] = symbol(x) * symbol("per_output")
-    entries["last_input"] = symbol("INPUT") * symbol("per_input")
+    for entry, i in zip(last_input_entries(model), model.inputs, strict=True):
+        entries[entry] = symbol(applied_row(i)) * symbol(f"PER_{i}")
     for y in model.outputs:
         entries[f"last_{y}"] = symbol(f"Y_{y}") * symbol("per_output")
     # One division serves all lanes where a number does not differ between them; both entries end at exactly 0.
@@ -270,15 +279,16 @@ def _observation_source(spec: KernelSpec) -> str:
         lines += [(f"B_{name}", value), (f"V_{name}", clip(symbol(f"B_{name}"), low, high))]
     uniform = [f"{letter}_{c}" for letter in ("PRIOR", "SCALE") for c in coefficients]
     uniform += ["LOG_gamma", *(f"LOG_xi_{y}" for y in model.outputs)]
-    scales = ["per_output", "per_input", "horizon", "per_horizon", "budget"]
+    per_input, scales = [f"PER_{i}" for i in model.inputs], ["per_output", "horizon", "per_horizon", "budget"]
     rows = {f"OBS_{name}": row for row, name in enumerate(entries)}
     source = print_lane_loop(
         "observe_lanes", lines, {f"OBS_{name}": f"V_{name}" for name in entries}, block_layout(spec), LANES,
-        (*uniform, *scales), doc="The observation, in rows.", shared_rows=rows,
+        (*uniform, *per_input, *scales), doc="The observation, in rows.", shared_rows=rows,
     )  # fmt: skip
     n, k = model.n_states, model.n_coefficients
     prior_arguments = [*(f"prior[{n + i}]" for i in range(k)), *(f"inverse_std[{i}]" for i in range(k))]
     prior_arguments += [f"log_precisions[{i}]" for i in range(1 + model.n_outputs)]
-    arguments = ", ".join(["W", "B", *prior_arguments, *scales])
-    signature = ", ".join(["W", "B", "prior", "inverse_std", "log_precisions", *scales])
+    input_arguments = [f"1.0 / max_input[{i}]" for i in range(len(per_input))]
+    arguments = ", ".join(["W", "B", *prior_arguments, *input_arguments, *scales])
+    signature = ", ".join(["W", "B", "prior", "inverse_std", "log_precisions", "max_input", *scales])
     return source + f"@scalar_jit\ndef observe({signature}):\n    observe_lanes({arguments})\n"

@@ -13,7 +13,7 @@ from estimator.compilation.simd import LANES, jit, lanewise
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 #: Distance of a float32 action from the float64 value that it stands for, at most, in parts of the input's scale.
-_FLOAT32_ROUNDING = 2.0**-22
+FLOAT32_ROUNDING = 2.0**-22
 
 
 def draw_two_normals(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
@@ -36,7 +36,7 @@ def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
 
 
 def limit_input(REQUESTED_INPUT, INPUT, LAST_INPUT, ENERGY_SPENT, budget, max_slew):
-    """The requested input, cut to the largest change from the last input and to the rest of the energy budget.
+    """An only input as requested, cut to the largest change from the last input and to the rest of the energy budget.
 
     ``ENERGY_SPENT`` is the energy Σ u² so far; the rest of the budget bounds the next input, so it cannot be exceeded.
     """
@@ -44,12 +44,6 @@ def limit_input(REQUESTED_INPUT, INPUT, LAST_INPUT, ENERGY_SPENT, budget, max_sl
     max_affordable = np.sqrt(max(budget - ENERGY_SPENT, 0.0))
     applied_input = min(max(applied_input, -max_affordable), max_affordable)
     return applied_input, INPUT, LAST_INPUT, applied_input - INPUT, ENERGY_SPENT + applied_input * applied_input
-
-
-def replay_sample(INPUT, REPLAYED_u, REPLAYED_y, max_input):
-    """The recorded input and output, and whether the action deviates from the recorded input."""
-    deviates = abs(INPUT - REPLAYED_u) > _FLOAT32_ROUNDING * max_input
-    return REPLAYED_u, REPLAYED_y, 1.0 if deviates else 0.0
 
 
 def pay_reward(REWARD, EPISODE_RETURN, TERMINATED, TRUNCATED, terminal, has_terminated_return, terminated_return):

@@ -1,4 +1,4 @@
-"""Stages of a compiled step on one block of environments: reset, input, plant, belief update, held actions.
+"""Stages of a compiled step on one block of environments: reset, replay, plant, belief update, held actions.
 
 Each function here compiles one stage for a kind of experiment; `duffing_env.kernel` calls them in order. A stage closes
 over plain integers, the offsets of rows in a block.
@@ -16,15 +16,18 @@ from duffing_env.rewards.reward_hooks import RewardHooks
 from duffing_env.storage.kernel_spec import (
     SUMMED_OUTCOMES,
     KernelSpec,
+    applied_row,
     block_layout,
     block_offsets,
+    input_places,
     missing_mean_field_rows,
     parameter_names,
 )
 from estimator.compilation.simd import LANES, jit_closure, lanewise
 from estimator.engine.kernels import compile_belief_update
-from estimator.engine.storage_layout import belief_rows
+from estimator.engine.storage_layout import belief_rows, input_history_row
 from estimator.inference import mean_field
+from estimator.models.model import MAX_INPUT_AGE
 
 
 def compile_truth_update(spec: KernelSpec, generated: Any, hooks: RewardHooks) -> Any:
@@ -49,16 +52,9 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
     offset_of, n_record = block_offsets(spec), len(belief_rows(spec.belief_model))
     first_stream, first_parameter = offset_of["SFC64_a"], offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
     jump_at, has_noise_hypotheses = offset_of["JUMP_AT"], spec.has_noise_hypotheses
-    zeroed_names = [
-        "INPUT",
-        "LAST_INPUT",
-        "OLDER_INPUT",
-        "ENERGY_SPENT",
-        "EPISODE_RETURN",
-        "ELAPSED_SAMPLES",
-        "NEEDS_RESET",
-        "HOOK_REWARD",
-    ]
+    zeroed_names = ["ENERGY_SPENT", "EPISODE_RETURN", "ELAPSED_SAMPLES", "NEEDS_RESET", "HOOK_REWARD"]
+    ages = range(MAX_INPUT_AGE + 1)
+    zeroed_names += [input_history_row(name, age) for name in spec.truth_model.inputs for age in ages]
     # Mean field's rows of a θ2 that the model does not have must be 0, also after an episode that ended with NaN.
     zeroed_names += missing_mean_field_rows(spec)
     zeroed_names += [f"Y_{y}" for y in spec.truth_model.outputs] + [f"X_{x}" for x in spec.truth_model.states]
@@ -86,43 +82,30 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
     return reset_lane
 
 
-def compile_input(spec: KernelSpec) -> Any:
-    """``apply_input(W, actions, lane, max_input, budget, max_slew)``: the actions of a block as limited inputs."""
-    requested_input, limited_rows = (
-        block_offsets(spec)["REQUESTED_INPUT"],
-        "INPUT LAST_INPUT OLDER_INPUT RISE ENERGY_SPENT",
-    )
-    limit_input = lanewise(block_layout(spec), limited_rows, uniform="budget max_slew")(plant_stages.limit_input)
-
-    @jit_closure(spec.name)
-    def apply_input(W, actions, lane, max_input, budget, max_slew):
-        for j in range(LANES):
-            W[requested_input + j] = max_input * max(-1.0, min(1.0, actions[lane + j]))
-        limit_input(W, budget, max_slew)
-
-    return apply_input
-
-
 def compile_replay(spec: KernelSpec) -> Any:
-    """``replay_sample(W, recorded, input_delay, max_input)``: a sample of the record in place of a plant."""
-    offset_of, first_sensor = block_offsets(spec), next(iter(spec.truth_model.outputs))
-    recorded_u_row, recorded_y_row, elapsed = (
-        offset_of["REPLAYED_u"],
-        offset_of["REPLAYED_y"],
-        offset_of["ELAPSED_SAMPLES"],
-    )
-    answer_input = lanewise(block_layout(spec), f"INPUT Y_{first_sensor} OFF_RECORD", uniform="max_input")(
-        plant_stages.replay_sample
-    )
+    """``replay_sample(W, recorded, input_delay, max_input)``: a sample of the record in place of a plant.
+
+    ``recorded`` (inputs + 1, T) holds the inputs and the first sensor's outputs. An action that deviates from the
+    recorded input is off the record.
+    """
+    offset_of, count = block_offsets(spec), spec.truth_model.n_inputs
+    elapsed, off_record = offset_of["ELAPSED_SAMPLES"], offset_of["OFF_RECORD"]
+    output_row = offset_of[f"Y_{next(iter(spec.truth_model.outputs))}"]
+    first_input, stride = input_places(spec, applied_row)
+    rounding = plant_stages.FLOAT32_ROUNDING
 
     @jit_closure(spec.name)
     def replay_sample(W, recorded, input_delay, max_input):
         last = recorded.shape[1] - 1
         for j in range(LANES):
             t = np.int64(W[elapsed + j])
-            W[recorded_u_row + j] = recorded[0, min(t, last)]
-            W[recorded_y_row + j] = recorded[1, min(t + input_delay, last)]
-        answer_input(W, max_input)
+            W[output_row + j] = recorded[count, min(t + input_delay, last)]
+            W[off_record + j] = 0.0
+            for i in range(count):
+                u = recorded[i, min(t, last)]
+                if abs(W[first_input + i * stride + j] - u) > rounding * max_input[i]:
+                    W[off_record + j] = 1.0
+                W[first_input + i * stride + j] = u
 
     return replay_sample
 

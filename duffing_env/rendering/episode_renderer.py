@@ -54,7 +54,8 @@ class EpisodeRenderer:
 
     Args:
         render_mode: ``rgb_array``, or ``human``: then `start` and `add_sample` show the frame in a window.
-        max_input, max_output: limits to draw, in internal units.
+        max_inputs: name of each input to its limit, in internal units.
+        max_output: limit of the output, in internal units.
         fps: largest number of frames per second in the window.
         scales: factors from internal to physical units, which the picture shows.
 
@@ -63,9 +64,14 @@ class EpisodeRenderer:
     """
 
     def __init__(
-        self, render_mode: str | None, max_input: float, max_output: float, fps: float, scales: Scales = VOLT_SCALES
+        self,
+        render_mode: str | None,
+        max_inputs: Mapping[str, float],
+        max_output: float,
+        fps: float,
+        scales: Scales = VOLT_SCALES,
     ) -> None:
-        self._limits, self._scales = (max_input, max_output), scales
+        self._limits, self._scales = (max_inputs, max_output), scales
         self._figure_cache: _EpisodeFigure | None = None
         self._window = _PygameWindow(fps) if render_mode == "human" else None
 
@@ -74,20 +80,22 @@ class EpisodeRenderer:
         names = shown_parameters(belief.model)
         self._truth = np.array([getattr(truth, name, np.nan) for name in names])
         self._labels = _axis_labels(belief)
+        self._input_units = {name: unit or self._scales.input_unit for name, unit in belief.model.inputs.items()}
         self._model = (
             "Duffing oscillator" if tuple(names) == tuple(_PARAMETER_LABELS) else belief.model.name.replace("_", " ")
         )
         self._horizon = horizon
         self._samples = 0
         self._prior_entropy = belief.entropy()
-        # Input, output and the belief after them; the prior has no input and output before it.
-        self._history: deque[tuple[float, float, Belief]] = deque(
-            [(np.nan, np.nan, belief)], maxlen=MAX_SAMPLES_SHOWN + 1
+        # Inputs, output and the belief after them; the prior has no input and output before it.
+        no_inputs = np.full(belief.model.n_inputs, np.nan)
+        self._history: deque[tuple[FloatArray, float, Belief]] = deque(
+            [(no_inputs, np.nan, belief)], maxlen=MAX_SAMPLES_SHOWN + 1
         )
         self._show()
 
-    def add_sample(self, u: float, y: float, belief: Belief) -> None:
-        """Add a sample: the applied input, the output after it, both in internal units, and the belief after it."""
+    def add_sample(self, u: FloatArray, y: float, belief: Belief) -> None:
+        """Add a sample: applied inputs (inputs,), the output after them, in internal units, and the belief after it."""
         self._samples += 1
         self._history.append((self._scales.input * u, self._scales.output * y, belief))
         self._show()
@@ -95,7 +103,9 @@ class EpisodeRenderer:
     def frame(self) -> Frame:
         """The episode so far, at most its last `MAX_SAMPLES_SHOWN` samples, as a new RGB array (HEIGHT, WIDTH, 3)."""
         if self._figure_cache is None:
-            self._figure_cache = _EpisodeFigure(*self._limits, self._scales, self._model, self._labels)
+            self._figure_cache = _EpisodeFigure(
+                *self._limits, self._scales, self._input_units, self._model, self._labels
+            )
         inputs, outputs, beliefs = zip(*self._history, strict=True)
         means, stds = _physical_moments(beliefs)
         gained = self._prior_entropy - beliefs[-1].entropy()
@@ -103,7 +113,8 @@ class EpisodeRenderer:
         return self._figure_cache.draw(
             status=f"sample {self._samples} of {self._horizon}, {gained:.1f} nats gained",
             extent=(first, max(self._samples, min(self._horizon, MAX_SAMPLES_SHOWN))),
-            signals=np.array([inputs, outputs]),
+            inputs=np.stack(inputs, axis=1),
+            outputs=np.array([outputs]),
             means=means,
             stds=stds,
             truth=self._truth,
@@ -166,7 +177,13 @@ class _EpisodeFigure:
     """
 
     def __init__(
-        self, max_input: float, max_output: float, scales: Scales, title: str, labels: Mapping[str, float]
+        self,
+        max_inputs: Mapping[str, float],
+        max_output: float,
+        scales: Scales,
+        input_units: Mapping[str, str],
+        title: str,
+        labels: Mapping[str, float],
     ) -> None:
         require_packages("matplotlib")
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -181,11 +198,15 @@ class _EpisodeFigure:
         self._extent: tuple[int, int] | None = None
 
         left, right = (0.06, 0.41), (0.575, 0.405)
-        u, y = _with_unit("input u", scales.input_unit), _with_unit("output y", scales.output_unit)
+        input_limits = {_with_unit(name, input_units[name]): scales.input * u for name, u in max_inputs.items()}
+        input_title = (
+            f"input {next(iter(input_limits))}" if len(input_limits) == 1 else "inputs in parts of their limits"
+        )
+        y = _with_unit("output y", scales.output_unit)
         height = _PARAMETER_PANELS_HEIGHT / len(labels)
         self._signals = (
-            SignalPanel(self._add_axes(*left, 0.52, 0.34), u, scales.input * max_input, "steps-pre"),
-            SignalPanel(self._add_axes(*left, 0.10, 0.34), y, scales.output * max_output, "default"),
+            SignalPanel(self._add_axes(*left, 0.52, 0.34), input_title, input_limits, "steps-pre"),
+            SignalPanel(self._add_axes(*left, 0.10, 0.34), y, {y: scales.output * max_output}, "default"),
         )
         self._parameters = [
             ParameterPanel(self._add_axes(*right, 0.10 + height * row, height - 0.06), name, unit)
@@ -202,24 +223,25 @@ class _EpisodeFigure:
         self._add_legend()
 
     def draw(
-        self, status: str, extent: tuple[int, int], signals: FloatArray, means: FloatArray, stds: FloatArray,
-        truth: FloatArray,
+        self, status: str, extent: tuple[int, int], inputs: FloatArray, outputs: FloatArray, means: FloatArray,
+        stds: FloatArray, truth: FloatArray,
     ) -> Frame:  # fmt: skip
         """Draw a frame.
 
         Args:
             status: the line beside the title.
             extent: first and last sample of the time axes. The arrays begin with the first.
-            signals: (2, n) inputs and outputs [V].
+            inputs: (inputs, n) inputs in their units.
+            outputs: (1, n) outputs in their unit.
             means: (parameters, n) means of the shown parameters.
             stds: (parameters, n) their standard deviations.
             truth: (parameters,) their true values.
         """
         if extent != self._extent:
             self._draw_background(extent)
-        times = self._sample * np.arange(extent[0], extent[0] + signals.shape[1])
+        times = self._sample * np.arange(extent[0], extent[0] + inputs.shape[1])
         self._status.set_text(status)
-        for signal_panel, values in zip(self._signals, signals, strict=True):
+        for signal_panel, values in zip(self._signals, (inputs, outputs), strict=True):
             signal_panel.update(times, values)
         for parameter_panel, mean, std, true in zip(self._parameters, means, stds, truth, strict=True):
             parameter_panel.update(times, mean, STDS_PER_90_PERCENT * std, true)

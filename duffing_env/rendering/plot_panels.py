@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,9 @@ from estimator.support.array_types import FloatArray
 
 INK, GREY, RULE = "#26323b", "#6f7b84", "#e3e7ea"
 SIGNAL, POSTERIOR, TRUTH = "#3d4f5c", "#1f6f9f", "#c4532d"
+
+#: Colours of several inputs, which repeat.
+_SEVERAL_SIGNALS = (SIGNAL, "#b8860b", "#4b8b3b", "#8e5ea2")
 _TITLE: dict[str, Any] = {"fontsize": 9, "pad": 4}
 
 #: A curve ends in a dot. Matplotlib leaves "animated" artists out of the background.
@@ -17,23 +22,43 @@ _CURVE: dict[str, Any] = {"marker": "o", "markersize": 3.5, "markevery": [-1], "
 
 
 class SignalPanel:
-    """Input or output over time, between its limits. A frame draws ``animated_artists`` over the background."""
+    """Inputs or an output over time, between limits. A frame draws ``animated_artists`` over the background.
 
-    def __init__(self, axes: Any, name: str, limit: float, drawstyle: str) -> None:
+    Several signals are drawn in parts of their limits, with a legend of their names.
+
+    Args:
+        axes: to draw in.
+        title: of the panel.
+        limits: name of each signal to its limit.
+        drawstyle: Matplotlib's, of the curves.
+    """
+
+    def __init__(self, axes: Any, title: str, limits: Mapping[str, float], drawstyle: str) -> None:
         self.axes = axes
-        axes.set_title(name, loc="left", color=INK, **_TITLE)
+        axes.set_title(title, loc="left", color=INK, **_TITLE)
+        is_single = len(limits) == 1
+        limit = next(iter(limits.values())) if is_single else 1.0
+        self._scales = [1.0 if is_single else 1.0 / each for each in limits.values()]
         self._edge = 1.15 * limit
         axes.set_ylim(-self._edge, self._edge)
         axes.set_yticks(limit * np.array([-1, -0.5, 0, 0.5, 1]))
         axes.yaxis.set_major_formatter("{x:.4g}")
         for edge in (-limit, limit):
             self.limit = axes.axhline(edge, color=GREY, linewidth=1, linestyle=(0, (1, 2)))
-        (self._curve,) = axes.plot([], color=SIGNAL, linewidth=1, drawstyle=drawstyle, **_CURVE)
-        self.animated_artists = (self._curve,)
+        self.animated_artists = tuple(
+            axes.plot([], color=color, linewidth=1, drawstyle=drawstyle, label=name, **_CURVE)[0]
+            for name, color in zip(limits, cycle(_SEVERAL_SIGNALS))
+        )
+        if not is_single:
+            axes.legend(
+                handles=self.animated_artists, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(limits),
+                fontsize=8, labelcolor=INK, frameon=False, handlelength=1.2, columnspacing=1.2, borderpad=0.0,
+            )  # fmt: skip
 
-    def update(self, times: FloatArray, values: FloatArray) -> None:
-        """Show values (n,) over times (n,), in the unit of the axis."""
-        self._curve.set_data(times, np.clip(values, -self._edge, self._edge))
+    def update(self, times: FloatArray, signals: FloatArray) -> None:
+        """Show signals (signals, n) over times (n,), each in the unit of its limit."""
+        for curve, scale, values in zip(self.animated_artists, self._scales, signals, strict=True):
+            curve.set_data(times, np.clip(scale * values, -self._edge, self._edge))
 
 
 class ParameterPanel:

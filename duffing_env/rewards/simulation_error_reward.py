@@ -8,7 +8,8 @@ The believed oscillator has the posterior's means for its coefficients. If it di
 
 The test input is a Schroeder multisine of `TEST_SAMPLES` samples: the first 20 multiples of 9.5 Hz at equal amplitude,
 so up to 191 Hz as the Silverbox's multisine. Its peak is half of ``max_input``, which moves the oscillators of the
-standard tracks by at most 0.35 V.
+standard tracks by at most 0.35 V. Of several inputs each gets the multisine from another place of its period on, so
+that they can be told apart.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
         generated.finish_misfit,
     )
     substeps, is_continuous = model.substeps, model.is_continuous
+    n_inputs, shift = model.n_inputs, TEST_SAMPLES // model.n_inputs
 
     @jit_closure(spec.name)
     def run_free_simulation(W, max_input):
@@ -110,11 +112,13 @@ def compile_hooks(spec: KernelSpec, generated: Any) -> RewardHooks:
         for i in range(first, last):
             W[i] = 0.0
         for t in range(TEST_SAMPLES):
-            input_now = max_input * TEST_INPUT[t]
-            input_before = max_input * TEST_INPUT[t - 1] if t > 0 else 0.0
-            input_before_last = max_input * TEST_INPUT[t - 2] if t > 1 else 0.0
-            for j in range(LANES):
-                feed_input(W, j, 0, input_now, input_before, input_before_last)
+            for i in range(n_inputs):
+                place = t + i * shift
+                input_now = max_input[i] * TEST_INPUT[place % TEST_SAMPLES]
+                input_before = max_input[i] * TEST_INPUT[(place - 1) % TEST_SAMPLES] if t > 0 else 0.0
+                input_before_last = max_input[i] * TEST_INPUT[(place - 2) % TEST_SAMPLES] if t > 1 else 0.0
+                for j in range(LANES):
+                    feed_input(W, j, i, input_now, input_before, input_before_last)
             if is_continuous:
                 for s in range(substeps):
                     step_believed(W, s / substeps)

@@ -7,7 +7,7 @@ A block holds `estimator.compilation.simd.LANES` environments: first the rows of
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import combinations
 from typing import Any, NamedTuple, get_type_hints
@@ -16,9 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.compilation.simd import LANES, jit_closure, number_rows
-from estimator.engine.storage_layout import belief_rows, integrator_rows, known_inputs, trace_rows, update_layout
+from estimator.engine.storage_layout import (
+    belief_rows,
+    input_history_row,
+    input_rows,
+    integrator_rows,
+    known_inputs,
+    trace_rows,
+    update_layout,
+)
 from estimator.models.difference_equation import difference
-from estimator.models.model import Model
+from estimator.models.model import MAX_INPUT_AGE, Model
 
 #: Adjacent rows of a block with the outcome of a step: reward, gains and flags.
 OUTCOME_ROWS = (
@@ -72,7 +80,7 @@ class KernelParams(NamedTuple):
     """The run-time parameters of a kernel, the same for all environments of an experiment.
 
     Attributes:
-        max_input: input of the action 1.
+        max_input: (inputs,) inputs of the action 1.
         max_output: limit of the first sensor.
         horizon: samples of an episode.
         iterations: variational iterations per sample.
@@ -89,14 +97,14 @@ class KernelParams(NamedTuple):
         prior: (size,) record that episodes start from.
         prior_inverse_std: (K,) 1 / standard deviation of the prior's coefficients.
         prior_log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
+        max_slew: (inputs,) largest changes of the inputs between samples.
+        sqrt_input_cost: (inputs,) square roots of the costs of inputs of 1.
         hold: samples of an action.
         max_samples: samples after which an outer limit truncates an episode, as Gymnasium's ``TimeLimit`` does.
         process_noise: standard deviation of the effect of one sample's process noise on the first sensor.
         noise_range: largest over smallest value that an episode draws for each noise; 1 draws no noises.
         spread: relative half width of the range of log-uniform parameters.
-        budget: largest energy Σ u² of an episode.
-        max_slew: largest change of the input between samples.
-        sqrt_input_cost: square root of the cost of an input of 1.
+        budget: largest energy of an episode: Σ u², over all inputs, each in its own unit.
         jump: largest relative jump of the first parameter.
         has_drift: whether the belief lets the coefficients walk at random.
         as_published: whether mean field departs from the paper as its published run did.
@@ -106,7 +114,7 @@ class KernelParams(NamedTuple):
         hypothesis_priors: (members, 5) first shape and rate of γ and of ξ of each of several beliefs, and its weight.
     """
 
-    max_input: float
+    max_input: npt.NDArray[np.float64]
     max_output: float
     horizon: float
     iterations: int
@@ -122,14 +130,14 @@ class KernelParams(NamedTuple):
     prior: npt.NDArray[np.float64]
     prior_inverse_std: npt.NDArray[np.float64]
     prior_log_precisions: npt.NDArray[np.float64]
+    max_slew: npt.NDArray[np.float64]
+    sqrt_input_cost: npt.NDArray[np.float64]
     hold: int = 1
     max_samples: float = np.inf
     process_noise: float = 0.0
     noise_range: float = 1.0
     spread: float = 0.0
     budget: float = np.inf
-    max_slew: float = np.inf
-    sqrt_input_cost: float = 0.0
     jump: float = 0.0
     has_drift: bool = False
     as_published: bool = False
@@ -152,6 +160,7 @@ def compile_unpacker(spec: KernelSpec) -> Any:
         "parameter_stds": n_parameters,
         "reward_weights": 4,
     }
+    sizes |= dict.fromkeys(("max_input", "max_slew", "sqrt_input_cost"), spec.truth_model.n_inputs)
     sizes |= dict.fromkeys(("walk_variances", "prior_inverse_std"), spec.belief_model.n_coefficients)
     sizes |= {"prior": len(belief_rows(spec.belief_model)), "prior_log_precisions": 1 + spec.belief_model.n_outputs}
     fields, offset = [], 0
@@ -175,7 +184,7 @@ def _compiled_unpacker(arguments: str) -> Any:
 def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
     """Entries of the observation of a belief, in order, with their bounds; `duffing_env.env` says what they are.
 
-    For K coefficients, n states and s sensors there are 2 K + K (K - 1) / 2 + n + 2 s + 4 entries.
+    For K coefficients, n states, s sensors and i inputs there are 2 K + K (K - 1) / 2 + n + 2 s + i + 3 entries.
     """
     names = list(model.coefficients)
     return {
@@ -185,11 +194,32 @@ def observation_bounds(model: Model) -> dict[str, tuple[float, float]]:
         "log_gamma": (-20.0, 20.0),
         **{f"log_xi_{y}": (-20.0, 20.0) for y in model.outputs},
         **{f"state_{x}": (-2.0, 2.0) for x in model.states},
-        "last_input": (-1.0, 1.0),
+        **dict.fromkeys(last_input_entries(model), (-1.0, 1.0)),
         **{f"last_{y}": (-2.0, 2.0) for y in model.outputs},
         "time_left": (0.0, 1.0),
         "budget_left": (0.0, 1.0),
     }
+
+
+def last_input_entries(model: Model) -> list[str]:
+    """Names of the entries of the last inputs: ``last_<input>`` of each, and ``last_input`` of an only input u."""
+    return ["last_input"] if list(model.inputs) == ["u"] else [f"last_{i}" for i in model.inputs]
+
+
+def rise_row(name: str) -> str:
+    """Name of the row of an input's change since the sample before."""
+    return f"RISE_{name}"
+
+
+def requested_row(name: str) -> str:
+    """Name of the row of the input that is asked for, before its limits."""
+    return f"REQUESTED_INPUT_{name}"
+
+
+def _environment_input_rows(name: str) -> list[str]:
+    """Adjacent rows of an input: as it is applied, of the two samples before, its rise, and what is asked for."""
+    ages = range(MAX_INPUT_AGE + 1)
+    return [*(input_history_row(name, age) for age in ages), rise_row(name), requested_row(name)]
 
 
 def parameter_names(model: Model) -> tuple[str, ...]:
@@ -215,7 +245,8 @@ def estimated_expressions(model: Model) -> Mapping[str, str]:
 def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     """Name of a quantity to its row in a block of this kind."""
     belief, truth = spec.belief_model, spec.truth_model
-    row_of = {name: row for name, row in update_layout(belief, spec.degree).items() if not name.startswith("U_")}
+    aliases = input_rows(belief, spec.degree)
+    row_of = {name: row for name, row in update_layout(belief, spec.degree).items() if name not in aliases}
     row_of = {name: row for row, name in enumerate(row_of)}
     row_names = [f"Y_{y}" for y in truth.outputs]
     row_names += [f"PARAM_{p}" for p in parameter_names(truth)]
@@ -224,27 +255,10 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     row_names += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
     row_names += [f"INVERSE_TRUE_{p}" for p in estimated_expressions(belief)]
     row_names += ["SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d", "NOISE_w", "NOISE_v"]
-    row_names += [
-        "INPUT",
-        "LAST_INPUT",
-        "OLDER_INPUT",
-        "RISE",
-        "REQUESTED_INPUT",
-        "ENERGY_SPENT",
-        "JUMP_AT",
-        "JUMP_FACTOR",
-    ]
-    row_names += [
-        "ELAPSED_SAMPLES",
-        "NEEDS_RESET",
-        "REPLAYED_u",
-        "REPLAYED_y",
-        "LOG_DET",
-        "LOG_DENSITY",
-        "PARAMETER_ERROR",
-        "HOOK_REWARD",
-        "EPISODE_RETURN",
-    ]
+    row_names += [row for i in truth.inputs for row in _environment_input_rows(i)]
+    row_names += ["ENERGY_SPENT", "JUMP_AT", "JUMP_FACTOR"]
+    row_names += ["ELAPSED_SAMPLES", "NEEDS_RESET", "LOG_DET", "LOG_DENSITY", "PARAMETER_ERROR"]
+    row_names += ["HOOK_REWARD", "EPISODE_RETURN"]
     row_names += OUTCOME_ROWS
     if spec.reward_hooks == "fisher":
         row_names += [f"FISHER_{name}" for name in belief_rows(belief) if name.startswith("P_")]
@@ -268,6 +282,17 @@ def block_offsets(spec: KernelSpec) -> dict[str, int]:
     return {name: row * LANES for name, row in block_layout(spec).items()}
 
 
+def input_places(spec: KernelSpec, row: Callable[[str], str]) -> tuple[int, int]:
+    """Place of a row of the first input in a flat block, and the distance to the same row of the next input."""
+    first = next(iter(spec.truth_model.inputs))
+    return block_offsets(spec)[row(first)], len(_environment_input_rows(first)) * LANES
+
+
+def applied_row(name: str) -> str:
+    """Name of the row of an input as it is applied in the last sample."""
+    return input_history_row(name, 0)
+
+
 def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
     """Rows that mean field needs, but a smaller model than the paper's does not have: they hold zeros."""
     if spec.factorisation != "mean_field":
@@ -277,12 +302,17 @@ def missing_mean_field_rows(spec: KernelSpec) -> list[str]:
 
 
 def model_input_rows(spec: KernelSpec, model: Model, row_of: Mapping[str, int]) -> dict[str, int]:
-    """Rows of a model's inputs over a sample: other names of rows that a block has anyway."""
-    # A difference equation takes the input at the sample before: the last action, where the input goes linearly from
-    # one action to the next.
+    """Rows of a model's inputs over a sample (`input_rows`): other names of rows that a block has anyway.
+
+    A difference equation takes each input at the sample before, the last action, where the inputs of the plant go
+    linearly from one action to the next.
+    """
+    inputs = list(model.inputs)
     lag = int(not model.is_continuous and spec.truth_model.is_continuous and spec.degree == 1)
-    rows = ("INPUT", "LAST_INPUT", "OLDER_INPUT")
-    return {
-        row.name: row_of["RISE" if row.subtracted_age is not None else rows[row.age]]
-        for row in known_inputs(model, spec.degree, lag)
-    }
+    rows = {}
+    for known in known_inputs(model, spec.degree, lag):
+        name = inputs[known.channel]
+        rows[known.name] = row_of[
+            input_history_row(name, known.age) if known.subtracted_age is None else rise_row(name)
+        ]
+    return rows

@@ -15,7 +15,9 @@ from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
 from duffing_env.env import DuffingEnv, Observation
-from duffing_env.experiment_config import MAX_SAMPLES, Experiment, check_prior
+from duffing_env.experiment_config import MAX_SAMPLES, Experiment
+from duffing_env.input_options import ByInput
+from duffing_env.prior_checks import check_prior
 from duffing_env.rewards.named_rewards import kernel_reward
 from estimator.belief import Belief
 from estimator.inference.noise_grid import NoiseGridSize
@@ -25,6 +27,7 @@ from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import equal_effect_log_ratio, reset_state, rig_prior
 from estimator.rigs.units import Scales
 from estimator.support.argument_checks import check_integer, short_repr
+from estimator.support.array_types import FloatArray
 
 RigLike = Rig | Mapping[str, Any] | str | Path
 
@@ -41,10 +44,11 @@ class Plant(Protocol):
     def reset(self) -> object:
         """Bring the plant to rest, without input; the returned object is ignored."""
 
-    def step(self, u: float) -> SupportsFloat | npt.NDArray[Any]:
+    def step(self, u: Any) -> SupportsFloat | npt.NDArray[Any]:
         """Apply the input u for one sampling step, and return the output at its end, both in the rig's units.
 
-        The output is one number, or an array that holds one.
+        The input is a float, or an array (inputs,) of several inputs. The output is one number, or an array that holds
+        one.
         """
         ...
 
@@ -84,7 +88,7 @@ class RigScaling:
     """The limits, units and sampling step of experiments on a rig."""
 
     rig: RigLike | None
-    max_input: float
+    max_input: ByInput
     max_output: float
 
     #: The guess makes a wide prior.
@@ -92,8 +96,9 @@ class RigScaling:
 
     def _check_fractions(self) -> None:
         for name in ("max_input", "max_output"):
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {getattr(self, name)!r}")
+            value = getattr(self, name)
+            if max(value.values() if isinstance(value, Mapping) else [value]) > 1:
+                raise ValueError(f"{name} must be at most 1, the rig's own limit, but is {value!r}")
 
     @property
     def validated_rig(self) -> Rig:
@@ -129,7 +134,7 @@ class RigPlantExperiment(RigScaling, Experiment):
     """
 
     rig: RigLike | None = None
-    max_input: float = 1.0
+    max_input: ByInput = 1.0
     max_output: float = 1.0
     horizon: int = 256
     prior: Belief | None = None
@@ -260,15 +265,16 @@ class RigPlantEnv(DuffingEnv):
         self._last_env_of_plant[id(self.plant)] = self
         self.plant.reset()
 
-    def _apply_sample(self, action: float) -> None:
+    def _apply_sample(self, action: float | FloatArray) -> None:
         if self._last_env_of_plant.get(id(self.plant), self) is not self:
             raise ResetNeeded(
                 f"plant must not be shared, but another environment has reset it meanwhile: {ONE_PLANT_MESSAGE}"
             )
         scales = self.experiment.scales
-        u = self.max_input * float(np.float32(action))
+        u = self.experiment.max_inputs * np.float32(action).astype(np.float64)
+        given = scales.input * u
         try:
-            y = as_number("step", self.plant.step(scales.input * u)) / scales.output
+            y = as_number("step", self.plant.step(given.item() if len(given) == 1 else given)) / scales.output
         except Exception as error:  # any error ends the episode in order, with its belief
             self.plant_error = f"{type(error).__name__}: {error}"
             logger.warn(f"plant.step failed, which ends the episode: {self.plant_error}")

@@ -11,6 +11,7 @@ import numpy as np
 from duffing_env.env import DuffingEnv
 from duffing_env.env_common import ReadOnlyOption
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.input_options import ByInput
 from duffing_env.tracks.external_plant_env import (
     ONE_PLANT_MESSAGE,
     Plant,
@@ -36,7 +37,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
     """
 
     rig: RigLike | None = None
-    max_input: float = 1.0
+    max_input: ByInput = 1.0
     max_output: float = 1.0
     process_noise: float | None = None  # type: ignore[assignment]
     measurement_noise: float | None = None  # type: ignore[assignment]

@@ -62,7 +62,7 @@ class ReplayExperiment(Experiment):
                 f"as_published goes with factorisation='mean_field', but factorisation is {self.factorisation!r}"
             )
         peak = float(np.abs(self._regime.u).max())
-        if self.max_input < peak:
+        if self.max_inputs[0] < peak:
             raise ValueError(
                 f"max_input must reach the record's largest input, {peak} V, but is {self.max_input}; pass 0.15"
             )
@@ -88,9 +88,9 @@ class ReplayExperiment(Experiment):
         return _PRIOR_FACTORIES[self.prior](self.model).with_factorisation(self.factorisation)
 
     @property
-    def replayed_record(self) -> tuple[FloatArray, FloatArray]:
+    def replayed_record(self) -> FloatArray:
         """The regime's input and output [V]."""
-        return self._regime.u, self._regime.y
+        return np.stack([self._regime.u, self._regime.y])
 
     @property
     def recorded_input(self) -> FloatArray:

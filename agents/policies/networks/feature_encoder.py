@@ -12,6 +12,7 @@ from agents.planning.model_probe import ModelView, observation_layout, planning_
 from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales
 from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.policies.networks.rollout_features import compile_features
+from duffing_env.input_options import check_single_input
 from estimator.compilation.simd import kernel
 from estimator.models.model import Model
 from estimator.support.argument_checks import short_repr
@@ -146,7 +147,7 @@ class FeatureEncoder:
 
         Raises:
             ValueError: for an environment that is not one of duffing_env, shows another observation than the
-                posterior, or holds its actions for several samples.
+                posterior, holds its actions for several samples, or has several inputs.
         """
         experiment = getattr(env, "experiment", None)
         if experiment is None:
@@ -160,15 +161,17 @@ class FeatureEncoder:
             )
         if experiment.hold != 1:
             raise ValueError(f"hold must be 1 for features, but is {experiment.hold}; train without features")
+        check_single_input("features", experiment.model, "choose a signal such as prbs")
         setup, view, prior = experiment.kernel_params, ModelView.of(experiment), experiment.prior_belief
         center = prior.coefficients_mean
-        time_scales = probe_time_scales(view, center, setup.max_input, setup.max_output)
+        max_input = float(setup.max_input[0])
+        time_scales = probe_time_scales(view, center, max_input, setup.max_output)
         setting = FeatureSettings(
             center=center,
             std=1.0 / setup.prior_inverse_std,
             information_rate=time_scales.mean_information,
             scales=time_scales.scales,
-            max_input=float(setup.max_input),
+            max_input=max_input,
             max_output=float(setup.max_output),
             limit=planning_limit(experiment, time_scales.scales),
             samples=float(setup.horizon),
@@ -178,7 +181,7 @@ class FeatureEncoder:
             accumulated_noise=kept_accumulated_noise(experiment, time_scales),
             hold_samples=float(time_scales.hold_samples),
             margin=MARGIN_KNOWN_NOISE if experiment.noise_hypotheses == 1 else MARGIN_UNKNOWN_NOISE,
-            step_response=abs(time_scales.step_response) * float(setup.max_input) / float(setup.max_output),
+            step_response=abs(time_scales.step_response) * max_input / float(setup.max_output),
             amplitude_growth=AMPLITUDE_GROWTH,
         )
         return cls(setting, view, with_observation=with_observation)

@@ -6,9 +6,8 @@ from functools import cache
 from itertools import combinations
 from typing import NamedTuple
 
-from agents.planning.model_probe import ModelView, observation_layout
+from agents.planning.model_probe import ModelView, observation_layout, only_input_rows
 from estimator.engine.noise_free_step import compile_noise_free_step
-from estimator.engine.storage_layout import input_history_row
 
 
 class RolloutRows(NamedTuple):
@@ -45,17 +44,18 @@ class RolloutRows(NamedTuple):
 def rollout_rows(view: ModelView) -> RolloutRows:
     """The rows of a model's rollout."""
     model, layout = view.model, observation_layout(view.model)
-    row, name = compile_noise_free_step(*view).layout, next(iter(model.inputs))
+    row = compile_noise_free_step(*view).layout
     # A push along the motion itself pumps: along the rise of an accelerometer's output it would brake.
     rate, states, sensor = (model.rates or ("",))[0], list(model.states), next(iter(model.outputs.values()))
     velocity_state = states.index(rate) if rate in states and sensor != states[0] else -1
+    newest, last, older = only_input_rows(model)
     return RolloutRows(
         size=len(row),
         n=model.n_states,
         k=model.n_coefficients,
-        u=row[input_history_row(name, 0)],
-        last=row[input_history_row(name, 1)],
-        older=row[input_history_row(name, 2)],
+        u=row[newest],
+        last=row[last],
+        older=row[older],
         now=row["NOW"],
         velocity=row["VELOCITY"] if velocity_state < 0 else row[rate],
         signal=row["Y_PRED"],

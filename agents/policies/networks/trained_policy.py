@@ -20,6 +20,7 @@ from agents.policies.networks.compiled_decision import CompiledActor, compile_de
 from agents.policies.networks.feature_encoder import FeatureEncoder
 from agents.policies.networks.lstm import FloatArray, Lstm, checked_tensor
 from agents.predict_argument_checks import check_observation_finite, check_observation_size
+from duffing_env.input_options import check_single_input
 from estimator.models.model import Model
 from estimator.support.argument_checks import check_integer, check_number, to_float_array
 from estimator.support.file_io import check_readable_file
@@ -148,10 +149,14 @@ class TrainedPolicy:
         """Play this unwrapped environment, with its prior, limits and noises, in place of the training's.
 
         Raises:
-            ValueError: for an environment with another observation than the card of the policy names. With features:
+            ValueError: for an environment with another observation than the card of the policy names, or with several
+                inputs. With features:
                 for one that `FeatureEncoder.of` refuses, or of another model than the training's, for a policy that
                 takes the observation as well.
         """
+        experiment = getattr(env, "experiment", None)
+        if experiment is not None:
+            check_single_input("a trained policy", experiment.model, "choose a signal such as prbs")
         shown = observation_name(env)
         if None not in (self._observation_name, shown) and shown != self._observation_name:
             wanted = "your function" if self._observation_name == "own" else repr(self._observation_name)

@@ -14,6 +14,7 @@ from agents.training.environments import oscillator_family
 from agents.training.environments.feature_vec_env import FeatureVecEnv
 from agents.training.environments.randomised_vec_env import DrawOptions, MixedVecEnv, TrackOptions, draw_track_options
 from agents.training.training_config import INFORMATION_REWARDS, TrainConfig
+from duffing_env.input_options import check_single_input
 
 #: Environments in which random actions are played to fit the normaliser of the features.
 N_NORMALISER_ENVS = 64
@@ -25,11 +26,19 @@ def make_training_envs(config: TrainConfig, seed: int) -> DuffingVecEnv | Featur
     Args:
         config: of the run, whose own seed the normaliser of the features is fitted with.
         seed: of the environments.
+
+    Raises:
+        ValueError: for a track with several inputs.
     """
     n = config.hyperparameters.num_envs
     if not config.hyperparameters.features:
         levels = getattr(config.hyperparameters, "levels", 0)
-        return DuffingVecEnv(config.env, n, seed=seed, levels=levels, **_options(config))
+        envs = DuffingVecEnv(config.env, n, seed=seed, levels=levels, **_options(config))
+        check_single_input(
+            "a trained policy", envs.envs.unwrapped.experiment.model,
+            "train with Stable-Baselines3 on agents.sb3_vec_env.DuffingVecEnv, and pass the model to make_policy",
+        )  # fmt: skip
+        return envs
     envs, samples = _feature_envs(config, n, seed)
     normaliser_envs, _ = _feature_envs(config, N_NORMALISER_ENVS, config.seed)
     envs.normalizer.fit(normaliser_envs, samples, config.seed)
