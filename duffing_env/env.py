@@ -13,12 +13,13 @@ from duffing_env.batch import Batch
 from duffing_env.custom_observation_and_reward import CustomFunctions
 from duffing_env.env_common import (
     ExperimentEnv,
+    action_of_several,
     action_space,
     check_reset_options,
-    checked_action,
     make_experiment,
     observation_space,
     refuse_concurrent_calls,
+    scalar_action,
 )
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
 from duffing_env.kernel import RESET_MANUALLY
@@ -268,7 +269,8 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
         """
         if not self._running:
             raise ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        clipped_action, custom = checked_action(action, self._n_inputs), self._custom
+        n = self._n_inputs
+        clipped_action, custom = scalar_action(action) if n == 1 else action_of_several(action, n), self._custom
         if custom is not None:
             custom.before_step()
         outcome = self._play_action(clipped_action)

@@ -36,14 +36,12 @@ def action_space(experiment: Experiment) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (experiment.model.n_inputs,), dtype=np.float32)
 
 
-def checked_action(action: npt.ArrayLike, n_inputs: int) -> float | FloatArray:
-    """The action clipped to [-1, 1]: a number for one input, (inputs,) numbers for several.
+def action_of_several(action: npt.ArrayLike, n_inputs: int) -> FloatArray:
+    """The action of several inputs (inputs,), clipped to [-1, 1].
 
     Raises:
         ValueError: for an action that is not one finite number for each input.
     """
-    if n_inputs == 1:
-        return _scalar_action(action)
     try:
         values = to_float_array("action", action)
     except ValueError:
@@ -56,8 +54,8 @@ def checked_action(action: npt.ArrayLike, n_inputs: int) -> float | FloatArray:
     return clipped
 
 
-def _scalar_action(action: npt.ArrayLike) -> float:
-    """The action as one number, clipped to [-1, 1].
+def scalar_action(action: npt.ArrayLike) -> float:
+    """The action of an only input as one number, clipped to [-1, 1].
 
     Raises:
         ValueError: for an action that is not one finite number.

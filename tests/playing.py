@@ -15,9 +15,9 @@ BY_HAND = AutoresetMode.DISABLED
 COPIES = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
 
 
-def random_actions(steps, rows=1, seed=0):
-    """Actions (steps, rows, 1), some beyond the limits; those of a row do not depend on the number of rows."""
-    columns = [np.random.default_rng([seed, row]).uniform(-1.2, 1.2, (steps, 1)) for row in range(rows)]
+def random_actions(steps, rows=1, seed=0, inputs=1):
+    """Actions (steps, rows, inputs), some beyond the limits; those of a row do not depend on the number of rows."""
+    columns = [np.random.default_rng([seed, row]).uniform(-1.2, 1.2, (steps, inputs)) for row in range(rows)]
     return np.stack(columns, axis=1).astype(np.float32)
 
 

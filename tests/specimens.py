@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reference.plants import DRAG
+from playing import random_actions
+from reference.plants import DRAG, TWO_MASSES
 
 from duffing_env.env import DuffingEnv
 from duffing_env.tracks.differential_equation_tracks import ContinuousEnv, ContinuousVectorEnv
@@ -162,6 +163,7 @@ class Environment:
         vector: makes some; None where there is no such.
         options: of both.
         sums: whether a held action gives the sum of what its samples give.
+        inputs: number of its inputs.
     """
 
     name: str
@@ -169,6 +171,10 @@ class Environment:
     vector: Callable[..., Any] | None
     options: dict[str, Any] = field(default_factory=dict)
     sums: bool = True
+    inputs: int = 1
+
+    def random_actions(self, steps, rows=1, seed=0):
+        return random_actions(steps, rows, seed, self.inputs)
 
     def make(self, **options):
         return self.single_env_class(**self.options | options)
@@ -188,6 +194,13 @@ class Environment:
 TIGHT = {"horizon": 22, "max_output": 0.22}
 GUESSED = {"noise_hypotheses": 3, "process_noise_guess": 1.5e-3, "noise_range": 10.0}
 KNOWN = {"noise_range": 1.0, "noise_hypotheses": 1}
+
+#: Two masses, whose forces have limits of their own and one budget, which ends before the episode.
+TWO_FORCES = {
+    "system": TWO_MASSES, "mean": {"stiffness": 0.3, "coupling": 0.1, "drag": 0.1, "gain": 0.3}, "spread": 0.2,
+    "process_noise": 1e-3, "measurement_noise": 1e-3, "sensor_noise": (2e-3,), "max_input": {"f1": 0.5, "f2": 0.2},
+    "max_slew": (0.6, 0.15), "max_rms": 0.25, "input_cost": 0.1, "max_output": 0.5, "horizon": 22,
+}  # fmt: skip
 
 difference_env = partial(Environment, single_env_class=DuffingEnv, vector=DuffingVectorEnv)
 continuous_env = partial(Environment, single_env_class=ContinuousEnv, vector=ContinuousVectorEnv)
@@ -225,6 +238,7 @@ COMPILED = [
         "process_noise": 1e-6, "measurement_noise": 1e-4, "sensor_noise": (3e-4,), "max_input": 0.5,
         "max_output": 0.7, "horizon": 22,
     }),
+    Environment("two inputs", ModelEnv, ModelVectorEnv, TWO_FORCES, inputs=2),
 ]  # fmt: skip
 
 #: Environments with the first one's kernel and other run-time parameters.

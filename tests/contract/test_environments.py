@@ -14,7 +14,6 @@ from playing import (
     continue_with,
     overwrite,
     play,
-    random_actions,
     roll_out,
     same,
 )
@@ -42,17 +41,19 @@ def test_what_is_given_has_the_types_and_bounds_that_trainers_check(environment)
     space, model = env.observation_space, env.experiment.model
     assert space.dtype == np.float32
     assert np.isfinite([space.low, space.high]).all()
-    assert env.action_space == gym.spaces.Box(-1, 1, (1,), np.float32)
+    assert env.action_space == gym.spaces.Box(-1, 1, (environment.inputs,))
     assert environment.make().observation_space is not space
     assert environment.make().action_space is not env.action_space
     if env.experiment.observation == "posterior":
         k = model.n_coefficients
-        assert space.shape == (2 * k + k * (k - 1) // 2 + model.n_states + 2 * model.n_outputs + 4,)
+        assert space.shape == (
+            2 * k + k * (k - 1) // 2 + model.n_states + 2 * model.n_outputs + 3 + environment.inputs,
+        )
     keys = {"information_gain", "diverged"}
     keys |= {"off_record"} if environment.on_record else set()
     keys |= set() if environment.has_plant else {"log_posterior_gain"}
     for seed in range(3):
-        (first, begun), *steps = play(env, random_actions(30, seed=seed)[:, 0], seed=seed)
+        (first, begun), *steps = play(env, environment.random_actions(30, seed=seed)[:, 0], seed=seed)
         assert begun == {key: key not in FLAGS and 0.0 for key in keys}
         for observation, reward, terminated, truncated, info in [(first, 0.0, False, False, begun), *steps]:
             assert type(observation) is np.ndarray
@@ -75,7 +76,7 @@ def test_what_a_vector_gives_has_the_types_and_bounds_that_trainers_check(enviro
     envs = environment.make_vec(3)
     observations, infos = envs.reset(seed=0)
     keys = {name: bool if name in FLAGS else float for name in infos if name[0] != "_"}
-    for action in random_actions(30, 3):
+    for action in environment.random_actions(30, 3):
         observations, rewards, *ends, infos = envs.step(action)
         assert observations in envs.observation_space
         assert (observations.dtype, rewards.dtype, *(end.dtype for end in ends)) == (np.float32, float, bool, bool)
@@ -93,7 +94,7 @@ def is_drawn(environment):
 
 @pytest.mark.parametrize("environment", each())
 def test_a_seed_repeats_a_whole_episode(environment):
-    env, actions = environment.make(), random_actions(30)[:, 0]
+    env, actions = environment.make(), environment.random_actions(30)[:, 0]
     first = play(env, actions, seed=7)
     others = [play(env, actions, seed=seed) for seed in (8, None, None)]
     assert_same(play(env, actions, seed=7), first)
@@ -105,8 +106,8 @@ def test_a_seed_repeats_a_whole_episode(environment):
 
 @pytest.mark.parametrize("environment", each())
 def test_copies_made_within_an_episode_continue_alike_and_apart(environment):
-    env, actions = environment.make(), random_actions(70, seed=1)[:, 0]
-    assert len(play(env, 0.3 * random_actions(5)[:, 0], seed=0)) == 6
+    env, actions = environment.make(), environment.random_actions(70, seed=1)[:, 0]
+    assert len(play(env, 0.3 * environment.random_actions(5)[:, 0], seed=0)) == 6
     twin, witness = (copied(env) for copied in COPIES)
     expected = continue_with(env, actions)
     assert any(len(given) == 2 for given in expected)  # it went on into further episodes
@@ -118,7 +119,7 @@ def test_copies_made_within_an_episode_continue_alike_and_apart(environment):
 
 @pytest.mark.parametrize("environment", VECTORS)
 def test_copies_of_a_vector_continue_alike_and_apart(environment):
-    envs, actions = environment.make_vec(5), random_actions(50, 5)
+    envs, actions = environment.make_vec(5), environment.random_actions(50, 5)
     roll_out(envs, actions[:20])
     twin, witness = (copied(envs) for copied in COPIES)
     expected = continue_vector(envs, actions[20:])
@@ -133,7 +134,7 @@ def test_a_held_action_is_the_same_action_at_every_sample(environment):
     for seed in range(12):
         given, expected = held.reset(seed=seed), sampled.reset(seed=seed)
         assert same(given, expected)
-        for action in random_actions(16, seed=seed)[:, 0]:
+        for action in environment.random_actions(16, seed=seed)[:, 0]:
             observation, reward, *flags, info = held.step(action)
             steps = []
             while len(steps) < 4 and not (steps and (steps[-1][2] or steps[-1][3])):
@@ -173,10 +174,10 @@ def test_numbers_that_are_not_finite_end_the_episode_flagged_and_leave_the_belie
     env = environment.make(max_output=max(0.6, environment.options["max_output"]))
     for name, value in impossible(env):
         env.reset(seed=0)
-        gained = sum(env.step([action])[1] for action in (0.3, -0.3))
+        gained = sum(env.step([action] * environment.inputs)[1] for action in (0.3, -0.3))
         overwrite(env, name, value)
         before, truth = env.belief, env.truth
-        observation, reward, terminated, truncated, info = env.step([0.0])
+        observation, reward, terminated, truncated, info = env.step([0.0] * environment.inputs)
         assert (terminated, truncated, info.pop("diverged")) == (True, False, True), (name, value)
         assert set(info.values()) == {0.0}
         assert observation in env.observation_space
@@ -188,13 +189,13 @@ def test_numbers_that_are_not_finite_end_the_episode_flagged_and_leave_the_belie
             assert reward == pytest.approx(0.0 if worth is None else worth - gained)
         again, _ = env.reset()
         assert again in env.observation_space
-        assert np.isfinite(env.step([0.5])[1])
+        assert np.isfinite(env.step([0.5] * environment.inputs)[1])
 
 
 @pytest.mark.parametrize("environment", DRAWN)
 def test_a_row_that_breaks_touches_no_other(environment):
     envs, plain = environment.make_vec(4), environment.make_vec(4)
-    actions = random_actions(20, 4)
+    actions = environment.random_actions(20, 4)
     for each_of in (envs, plain):
         roll_out(each_of, actions[:3])
     overwrite(envs, f"X_{next(iter(envs.experiment.truth_model.states))}", np.nan, row=2)
@@ -209,7 +210,7 @@ def test_gains_sum_to_the_change_of_the_belief(environment):
     env = environment.make()
     prior, model = env.belief, env.experiment.model
     for seed in range(5):
-        steps = play(env, random_actions(60, seed=seed)[:, 0], seed=seed)[1:]
+        steps = play(env, environment.random_actions(60, seed=seed)[:, 0], seed=seed)[1:]
         if steps[-1][4]["diverged"]:
             continue
         final, truth = env.belief, coefficients_of(model, env.truth, env.experiment.scales)
@@ -244,7 +245,8 @@ EXTREMES = [
 @pytest.mark.parametrize("environment", DRAWN)
 def test_observations_stay_in_their_space_and_rewards_finite(environment):
     rng = np.random.default_rng(0)
-    actions = np.stack([rng.uniform(-1, 1, (128, 4)), rng.choice([-1.0, 1.0], (128, 4))], axis=1).reshape(128, 8, 1)
+    shape = (128, 4, environment.inputs)
+    actions = np.concatenate([rng.uniform(-1, 1, shape), rng.choice([-1.0, 1.0], shape)], axis=1)
     for options in EXTREMES:
         if environment.name == "rig" and (options.keys() & {"spread"} or options.get("max_output", 0) > 1):
             continue  # which the rig says
@@ -289,9 +291,9 @@ def test_bad_options_are_named(environment):
 @pytest.mark.parametrize("environment", each())
 def test_the_belief_of_an_episode_stays_as_it_was(environment):
     env = environment.make()
-    play(env, random_actions(30)[:, 0], seed=0)
+    play(env, environment.random_actions(30)[:, 0], seed=0)
     belief, kept = env.belief, copy.deepcopy(env.belief)
-    play(env, random_actions(30, seed=1)[:, 0])
+    play(env, environment.random_actions(30, seed=1)[:, 0])
     assert same(belief, kept)
     assert not same(belief, env.belief)
 

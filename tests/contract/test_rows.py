@@ -5,7 +5,7 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from playing import BY_HAND, MODES, assert_same, continue_vector, random_actions, roll_out, same
+from playing import BY_HAND, MODES, assert_same, continue_vector, roll_out, same
 from specimens import ENVIRONMENTS, VECTORS
 
 from duffing_env.batch import spawn_seeds
@@ -42,7 +42,7 @@ def assert_rows_are_singles(environment, mode, rows=5, steps=60, **options):
     singles = SyncVectorEnv(makers, autoreset_mode=mode)
     for space in ("single_observation_space", "observation_space", "single_action_space", "action_space"):
         assert getattr(envs, space) == getattr(singles, space)
-    actions = random_actions(steps, rows)
+    actions = environment.random_actions(steps, rows)
     ours, theirs = roll_out(envs, actions, seed=7), roll_out(singles, actions, seed=spawn_seeds(7, rows))
     assert_same([given[:-1] for given in ours], [given[:-1] for given in theirs])
     assert_same([without_endings(given[-1]) for given in ours], [given[-1] for given in theirs])
@@ -87,7 +87,7 @@ def test_rows_that_hold_their_actions_are_single_environments(environment):
 @pytest.mark.parametrize("environment", VECTORS)
 def test_rows_do_not_depend_on_their_neighbours_in_a_block(environment):
     # A block has 32 lanes: the first row alone, rows across two blocks, and one of a third, which is not full.
-    whole, actions, seeds = environment.make_vec(70), random_actions(30, 70), spawn_seeds(3, 70)
+    whole, actions, seeds = environment.make_vec(70), environment.random_actions(30, 70), spawn_seeds(3, 70)
     together = roll_out(whole, actions, 3)
     for rows in (range(1), range(29, 36), range(69, 70)):
         few = environment.make_vec(len(rows))
@@ -100,19 +100,21 @@ def test_rows_do_not_depend_on_their_neighbours_in_a_block(environment):
 @pytest.mark.parametrize("options", [{}, {"hold": 4}, {"autoreset_mode": "SameStep"}], ids=str)
 def test_threads_change_nothing(options):
     # Blocks are dealt to threads in one way for all kernels, of which each would be seconds of compilation.
-    actions = random_actions(40, 70)
+    actions = ENVIRONMENTS[0].random_actions(40, 70)
     one, two = (ENVIRONMENTS[0].make_vec(70, threads=threads, **options) for threads in (1, 2))
     assert_same(roll_out(one, actions, seed=5), roll_out(two, actions, seed=5))
 
 
-@pytest.mark.parametrize("environment", [p for p in VECTORS if p.id in ("difference", "hypotheses", "continuous")])
+@pytest.mark.parametrize(
+    "environment", [p for p in VECTORS if p.id in ("difference", "hypotheses", "continuous", "two inputs")]
+)
 def test_the_stored_arrays_determine_the_next_step(environment):
     envs, others = environment.make_vec(5), environment.make_vec(5)
-    roll_out(envs, random_actions(30, 5))
+    roll_out(envs, environment.random_actions(30, 5))
     others.reset(seed=99)
     for name, values in envs.memory.items():
         others.memory[name][...] = values
-    actions = random_actions(20, 5, seed=1)
+    actions = environment.random_actions(20, 5, seed=1)
     assert_same(
         [step[:4] for step in continue_vector(others, actions)], [s[:4] for s in continue_vector(envs, actions)]
     )
@@ -120,7 +122,7 @@ def test_the_stored_arrays_determine_the_next_step(environment):
 
 def test_rows_are_reset_by_hand_alone():
     envs = ENVIRONMENTS[0].make_vec(5, autoreset_mode=BY_HAND)
-    before = roll_out(envs, random_actions(7, 5))[-1][0]
+    before = roll_out(envs, ENVIRONMENTS[0].random_actions(7, 5))[-1][0]
     again, infos = envs.reset(seed=11, options={"reset_mask": np.arange(5) == 2})
     assert same(np.delete(again, 2, 0), np.delete(before, 2, 0))
     assert infos["_information_gain"].tolist() == [False, False, True, False, False]

@@ -37,6 +37,22 @@ TANKS = Model(
     outputs={"level": "lower + bias", "top": "upper + 0.1*u"},
 )
 
+#: Two masses in a chain of springs, a force on each, and the positions of both.
+TWO_MASSES = Model(
+    name="two_masses",
+    states={"x1": "m", "v1": "m", "x2": "m", "v2": "m"},
+    coefficients={"stiffness": "1", "coupling": "1", "drag": "1", "gain": "1"},
+    inputs={"f1": "N", "f2": "N"},
+    rates=(
+        "v1",
+        "gain*f1 - stiffness*x1 - drag*v1 - coupling*(x1 - x2)",
+        "v2",
+        "gain*f2 - stiffness*x2 - drag*v2 - coupling*(x2 - x1)",
+    ),
+    noise=("0", "sqrt(3)", "0", "sqrt(3)"),
+    outputs={"y1": "x1", "y2": "x2"},
+)
+
 #: Model, interpolation, coefficients, scale of the input.
 CASES = {
     "paper": (difference(), "zero_order", [1.48, -1.47, -0.939, 0.39], 0.12),
