@@ -109,7 +109,7 @@ def plot_log_posterior_gain(evaluations: list[Evaluation], title: str = "") -> F
 def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
     """Input and output of the first system in time, and the inputs' RMS spectrum over systems.
 
-    Of several sensors the first is drawn. Dashed lines are limits, where a signal comes near to them.
+    Of several inputs and sensors the first ones are drawn. Dashed lines are limits, where a signal comes near to them.
     """
     figure = new_figure(12, 1.6 * len(evaluations) + 0.8)
     grid = figure.subplots(len(evaluations), 3, sharex="col", sharey="col", squeeze=False)
@@ -119,12 +119,13 @@ def plot_inputs_and_outputs(evaluations: list[Evaluation]) -> Figure:
         spectrum_unit, factor = "mV", 1e3 * factor
     for row, evaluation, colour in zip(grid, evaluations, cycle(_COLOURS), strict=False):
         time = 1e3 * scales.step * np.arange(len(evaluation.inputs))
-        inputs = np.nan_to_num(evaluation.inputs)  # zero after the end of an episode
+        first_input = evaluation.inputs.reshape(*evaluation.inputs.shape[:2], -1)[..., 0]
+        inputs = np.nan_to_num(first_input)  # zero after the end of an episode
         spectrum = factor * np.sqrt(np.mean(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1)) / len(inputs)
         frequencies = np.fft.rfftfreq(len(inputs), scales.step)
         first_sensor = evaluation.outputs[:, 0].reshape(len(time), -1)[:, 0]
         lines = (
-            (axis_label("u", unit), time, scales.input * evaluation.inputs[:, 0]),
+            (axis_label("u", unit), time, scales.input * first_input[:, 0]),
             (axis_label("y", scales.output_unit), time, scales.output * first_sensor),
             (axis_label("|U|", spectrum_unit), frequencies, spectrum),
         )

@@ -70,8 +70,14 @@ def posterior_metrics(
 
 
 def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
-    """Power, peak and crest factor (peak over RMS) of inputs (T, n), NaN after the end of an episode."""
-    power, peak = np.nanmean(inputs**2, axis=0), np.nanmax(np.abs(inputs), axis=0)
+    """Power, peak and crest factor (peak over RMS) of inputs (T, n), NaN after the end of an episode.
+
+    Of several inputs (T, n, inputs), each in its own unit, the power is the sum, and the peak the largest of
+    sqrt(Σ u²).
+    """
+    squares = inputs**2 if inputs.ndim == 2 else (inputs**2).sum(axis=2)
+    power = np.nanmean(squares, axis=0)
+    peak = np.nanmax(np.abs(inputs) if inputs.ndim == 2 else np.sqrt(squares), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         crest = np.where(power > 0, peak / np.sqrt(power), np.nan)
     return {"input_power": power, "input_peak": peak, "crest_factor": crest}
@@ -80,7 +86,9 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
 def fisher_information_gain(
     inputs: FloatArray, truth: Parameters, experiment: SimulatedExperiment, outputs: FloatArray | None = None
 ) -> FloatArray:
-    """Information gain (n,) of an efficient estimator from inputs (T, n): ½ log det(Λ0 + F) - ½ log det Λ0 [nats].
+    """Information gain (n,) of an efficient estimator from inputs: ½ log det(Λ0 + F) - ½ log det Λ0 [nats].
+
+    The inputs are (T, n), or (T, n, inputs) of several.
 
     F is the Fisher information at the true coefficients of the plant's equation, along the measured outputs (T, n) or
     (T, n, sensors), or along the response without noise; Λ0 is the inverse covariance of the prior from which the
@@ -88,7 +96,7 @@ def fisher_information_gain(
     """
     plant = plant_model_of(experiment, truth)
     F = fisher_information(
-        plant.model, plant.coefficients_of(truth), inputs.T, plant.process_noise, plant.sensor_noises,
+        plant.model, plant.coefficients_of(truth), np.swapaxes(inputs, 0, 1), plant.process_noise, plant.sensor_noises,
         interpolation=plant.interpolation, y=None if outputs is None else np.swapaxes(outputs, 0, 1),
     )  # fmt: skip
     cov = plant.prior.coefficients_cov

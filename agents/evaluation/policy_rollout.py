@@ -46,7 +46,7 @@ class Evaluation:
         scales: units of inputs and outputs, and the sampling step.
         estimator_metrics: name of another estimator to its metrics on the same inputs and outputs.
         seeds: number of training seeds.
-        limits: of each input and of the output, in units of their scales.
+        limits: of the first input and the first output, in units of their scales.
     """
 
     policy: str
@@ -57,7 +57,7 @@ class Evaluation:
     scales: Scales
     estimator_metrics: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
     seeds: int = 1
-    limits: tuple[tuple[float, ...], float] = ((np.inf,), np.inf)
+    limits: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def title(self) -> str:
@@ -105,12 +105,13 @@ def run_episodes(
     prior, beliefs = trace.prior, trace.beliefs
     means = np.array([belief.coefficients_mean for belief in beliefs])
     covs = np.array([belief.coefficients_cov for belief in beliefs])
+    inputs, outputs = (series[..., 0] if series.shape[-1] == 1 else series for series in (trace.inputs, trace.outputs))
     values = {
         "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
         "log_posterior_gain": trace.gain_curve[-1],
         **metrics.posterior_metrics(means, covs, truth, prior.model, prior.scales),
         "ended_early": trace.ended_early,
-        **metrics.input_metrics(prior.scales.input * trace.inputs),
+        **metrics.input_metrics(prior.scales.input * inputs),
         # Processor time. The first call may compile, and counts where there is no other.
         "decision_time": np.full(systems, np.mean(trace.decision_times[1:] or trace.decision_times) / systems),
     }
@@ -119,9 +120,10 @@ def run_episodes(
         policy_title(name),
         values,
         trace.gain_curve,
-        *(series[..., 0] if series.shape[-1] == 1 else series for series in (trace.inputs, trace.outputs)),
+        inputs,
+        outputs,
         prior.scales,
-        limits=(tuple(setup.max_input.tolist()), setup.max_output),
+        limits=(float(setup.max_input[0]), setup.max_output),
     )
     return PlayedEpisodes(evaluation, beliefs, truth, envs.experiment)
 

@@ -94,10 +94,10 @@ class EpisodeRenderer:
         )
         self._show()
 
-    def add_sample(self, u: FloatArray, y: float, belief: Belief) -> None:
+    def add_sample(self, u: float | FloatArray, y: float, belief: Belief) -> None:
         """Add a sample: applied inputs (inputs,), the output after them, in internal units, and the belief after it."""
         self._samples += 1
-        self._history.append((self._scales.input * u, self._scales.output * y, belief))
+        self._history.append((np.atleast_1d(self._scales.input * u), self._scales.output * y, belief))
         self._show()
 
     def frame(self) -> Frame:
@@ -198,10 +198,12 @@ class _EpisodeFigure:
         self._extent: tuple[int, int] | None = None
 
         left, right = (0.06, 0.41), (0.575, 0.405)
-        input_limits = {_with_unit(name, input_units[name]): scales.input * u for name, u in max_inputs.items()}
-        input_title = (
-            f"input {next(iter(input_limits))}" if len(input_limits) == 1 else "inputs in parts of their limits"
-        )
+        if len(max_inputs) == 1:
+            input_title = _with_unit(f"input {next(iter(max_inputs))}", next(iter(input_units.values())))
+        else:
+            input_title = "inputs in parts of their limits"
+        input_limits = {name: scales.input * u for name, u in max_inputs.items()}
+        input_limits = {f"{name} (±{u:.4g} {input_units[name]})": u for name, u in input_limits.items()}
         y = _with_unit("output y", scales.output_unit)
         height = _PARAMETER_PANELS_HEIGHT / len(labels)
         self._signals = (

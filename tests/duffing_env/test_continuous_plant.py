@@ -56,7 +56,7 @@ def test_the_drift_is_eq_1_to_far_below_the_noise():
     rng = np.random.default_rng(0)
     x, v = rng.uniform(-0.3, 0.3, (2, LANES))
     last_u, u = rng.uniform(-0.15, 0.15, (2, LANES))
-    by_row = lanes(X_x=x, X_v=v, LAST_INPUT=last_u, RISE=u - last_u)
+    by_row = lanes(X_x=x, X_v=v, LAST_INPUT_u=last_u, RISE_u=u - last_u)
     step(by_row)
     twin = SILVERBOX_ODE_TWIN
     for j in range(LANES):
@@ -75,7 +75,7 @@ def test_the_drift_is_eq_1_to_far_below_the_noise():
 
 def test_a_constant_input_ends_where_the_spring_holds_it():
     u = np.linspace(-0.15, 0.15, LANES)
-    by_row = lanes(LAST_INPUT=u)
+    by_row = lanes(LAST_INPUT_u=u)
     for _ in range(1000):
         step(by_row)
     x = by_row[PLACE["X_x"]]

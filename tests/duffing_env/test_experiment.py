@@ -111,8 +111,9 @@ def test_settings_are_the_options():
     assert (kind.iterations, kind.reward_hooks) == (0, "free_energy")
     expected = {
         "iterations": 4, "has_drift": False, "jump": 0.0, "terminal": False, "has_terminated_return": False,
-        "max_input": 0.1, "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
-        "input_delay": 0, "as_published": False, "step": SILVERBOX_SAMPLING_STEP, "budget": np.inf, "max_slew": np.inf,
+        "max_input": [0.1], "max_output": 0.5, "horizon": 9.0, "process_noise": 1e-3, "spread": 0.1, "hold": 1,
+        "input_delay": 0, "as_published": False, "step": SILVERBOX_SAMPLING_STEP, "budget": np.inf,
+        "max_slew": [np.inf],
     }  # fmt: skip
     assert {name: getattr(setup, name) for name in expected} == expected
     assert setup.measurement_noise.tolist() == [2e-3]
@@ -140,7 +141,7 @@ def test_defaults_are_those_of_the_documentation():
     assert (kind.factorisation, kind.iterations, kind.reward_hooks) == ("structured", 3, "")
     assert setup.reward_weights.tolist() == [1.0, 0.0, 0.0, 0.0]
     assert SimulatedExperiment(factorisation="mean_field").kernel_params.iterations == 10
-    assert (setup.max_input, setup.max_output, setup.horizon) == (0.15, 0.6, 256)
+    assert (setup.max_input.tolist(), setup.max_output, setup.horizon) == ([0.15], 0.6, 256)
     assert (setup.process_noise, setup.measurement_noise.tolist(), setup.spread) == (5e-4, [5e-4], 0.3)
 
 

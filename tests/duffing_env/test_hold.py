@@ -36,7 +36,7 @@ def test_limits_hold_for_every_sample():
     envs.reset(seed=0)
     single.reset(seed=0)
     inputs, apply = [], single._apply_sample
-    single._apply_sample = lambda action: (apply(action), inputs.append(single._batch.row_values("INPUT")[0]))
+    single._apply_sample = lambda action: (apply(action), inputs.append(single._batch.row_values("INPUT_u")[0]))
     for _ in range(8):
         envs.step(np.ones((3, 1), dtype=np.float32))
         single.step([1.0])

@@ -101,7 +101,7 @@ def test_the_belief_is_that_of_the_online_estimator(case):
     u, y, rewards = np.empty((3, 256))
     for t, action in enumerate(random_actions(256)[:, 0]):
         rewards[t] = env.step(action)[1]
-        u[t], y[t] = env._batch.row_values("INPUT")[0], env._batch.row_values("Y_y")[0]
+        u[t], y[t] = env._batch.row_values("INPUT_u")[0], env._batch.row_values("Y_y")[0]
     energies = estimator.run(u, y)
     np.testing.assert_allclose(-rewards, energies[:, -1], rtol=1e-9, atol=1e-9)
     close(env.belief, estimator.belief)

@@ -7,7 +7,8 @@ from twin import to_coefficients
 
 from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.kernel_stages.generated_environment_functions import generated_functions
-from duffing_env.kernel_stages.plant_stages import compile_noise_draw, replay_sample
+from duffing_env.kernel_stages.plant_stages import compile_noise_draw
+from duffing_env.kernel_stages.sample_stages import compile_replay
 from duffing_env.storage.kernel_spec import block_layout
 from estimator import SILVERBOX_TWIN
 from estimator.compilation.simd import LANES
@@ -40,7 +41,7 @@ def test_difference_plant_is_eq_2_with_a_noisy_sensor():
     w, v = rng.standard_normal((2, LANES))
     t1, t2, t3, e = rng.uniform(-2, 2, (4, LANES))
     flat, row = block(
-        X_x1=x, X_x2=last_x, INPUT=u, NOISE_w=w, NOISE_v=v, **dict(zip(COEFFICIENTS, (t1, t2, t3, e), strict=True))
+        X_x1=x, X_x2=last_x, INPUT_u=u, NOISE_w=w, NOISE_v=v, **dict(zip(COEFFICIENTS, (t1, t2, t3, e), strict=True))
     )
     move_plant(flat, 3e-4, 2e-2)
     moved = t1 * x + t2 * x**3 + t3 * last_x + e * u + 3e-4 * w
@@ -49,13 +50,13 @@ def test_difference_plant_is_eq_2_with_a_noisy_sensor():
     assert (np.abs(row("X_x1") - moved) <= 16 * U64 * size).all()
     np.testing.assert_array_equal(row("X_x2"), x)
     assert (np.abs(row("Y_y") - moved - 2e-2 * v) <= 16 * U64 * (size + np.abs(2e-2 * v))).all()
-    np.testing.assert_array_equal(row("INPUT"), u)
+    np.testing.assert_array_equal(row("INPUT_u"), u)
 
 
 def test_a_constant_input_ends_where_the_spring_holds_it():
     # a x + b x³ = u knows nothing of the discretisation.
     u = np.linspace(-0.15, 0.15, LANES)
-    flat, row = block(INPUT=u, **TRUE)
+    flat, row = block(INPUT_u=u, **TRUE)
     for _ in range(4000):
         move_plant(flat, 0.0, 0.0)
     x = row("X_x1")
@@ -87,5 +88,7 @@ def test_noise_is_scaled_once_and_the_stream_of_a_waiting_lane_stands_still():
 @pytest.mark.parametrize(("deviation", "off_record"), [(0.0, 0.0), (2e-8, 0.0), (-2e-8, 0.0), (1e-7, 1.0), (-0.1, 1.0)])
 def test_a_record_answers_the_recorded_input_only(deviation, off_record):
     # A float32 action in [-1, 1] is within 3e-8 of the number that it stands for; here it is scaled by 0.15.
-    answer = replay_sample(0.1 + deviation, REPLAYED_u=0.1, REPLAYED_y=-0.3, max_input=0.15)
-    assert answer == (0.1, -0.3, off_record)
+    flat, row = block(INPUT_u=0.1 + deviation, OFF_RECORD=0.5)
+    compile_replay(KIND).py_func(flat, np.array([[0.1], [-0.3]]), 0, np.array([0.15]))
+    for name, expected in (("INPUT_u", 0.1), ("Y_y", -0.3), ("OFF_RECORD", off_record)):
+        np.testing.assert_array_equal(row(name), expected)

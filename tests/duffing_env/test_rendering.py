@@ -37,7 +37,7 @@ def changed(**entries):
 
 
 def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):
-    screen = EpisodeRenderer("rgb_array", 0.15, 0.6, 30)
+    screen = EpisodeRenderer("rgb_array", {"u": 0.15}, 0.6, 30)
     screen.start(truth, belief, horizon)
     return screen
 
@@ -125,7 +125,7 @@ def test_curves_and_numbers_are_those_of_the_episode():
         shown = f"{mean[-1, row] / unit:.3f} ± {half[-1, row] / unit:.3f}"
         assert panel._estimate.get_text() == shown
         assert panel._true_value.get_text() == f"true {truth[row] / unit:.3f}"
-    np.testing.assert_allclose(screen._figure_cache._signals[0]._curve.get_ydata()[1:], inputs, rtol=1e-6)
+    np.testing.assert_allclose(screen._figure_cache._signals[0].animated_artists[0].get_ydata()[1:], inputs, rtol=1e-6)
     assert screen._figure_cache._status.get_text() == f"sample 20 of 256, {gained:.1f} nats gained"
 
 
@@ -143,7 +143,7 @@ def test_curves_and_numbers_are_those_of_the_episode():
 )
 def test_other_models_are_drawn_with_their_own_names_units_and_truth(track, title, labels, signals):
     experiment = ModelExperiment(**TRACKS[f"duffing_env/{track}"]["kwargs"])
-    screen = EpisodeRenderer("rgb_array", experiment.max_input, experiment.max_output, 30, experiment.scales)
+    screen = EpisodeRenderer("rgb_array", {"u": experiment.max_input}, experiment.max_output, 30, experiment.scales)
     truth = Parameters({name: 1.1 * value + 0.01 for name, value in experiment.nominal_parameters.items()})
     screen.start(truth, experiment.prior_belief, 256)
     screen.add_sample(0.1, 0.2, experiment.prior_belief)
@@ -268,7 +268,7 @@ def test_window_shows_the_frames_at_the_rate_and_closes(no_display):
     def seen():
         return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
 
-    screen = EpisodeRenderer("human", 0.15, 0.6, fps=20)
+    screen = EpisodeRenderer("human", {"u": 0.15}, 0.6, fps=20)
     screen.start(SILVERBOX_TWIN, PRIOR, 100)
     empty = seen()
     np.testing.assert_array_equal(empty, started().frame())
@@ -301,4 +301,4 @@ def test_environment_in_mode_human_returns_no_array(no_display):
 def test_mode_human_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(DependencyNotInstalled, match=r'pip install "duffing-env\[human\]"'):
-        EpisodeRenderer("human", 0.15, 0.6, 30)
+        EpisodeRenderer("human", {"u": 0.15}, 0.6, 30)

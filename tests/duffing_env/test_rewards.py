@@ -75,10 +75,10 @@ class Lanes:
             self.code.evaluate_belief(self.rows.reshape(-1), lane, SILVERBOX_SAMPLING_STEP)
 
     def settle(self, input_cost=0.0, terminal=False, terminated_return=None):
-        weights = REWARDS[self.reward].weights
-        price = np.sqrt(input_cost)
+        weights = np.array(REWARDS[self.reward].weights)
+        price = np.array([np.sqrt(input_cost)])
         self.code.finish_step(
-            self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, *weights
+            self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, weights
         )
         forfeits = terminated_return is not None
         if terminal or forfeits:
@@ -165,9 +165,9 @@ def test_a_step_pays_the_increase_of_the_named_measure(reward):
 
 def test_an_input_costs_what_is_asked_for_it():
     lanes = Lanes()
-    lanes["INPUT"][:] = np.linspace(-0.15, 0.15, LANES)
+    lanes["INPUT_u"][:] = np.linspace(-0.15, 0.15, LANES)
     lanes.settle(input_cost=2.0)
-    np.testing.assert_allclose(lanes["REWARD"], -2.0 * lanes["INPUT"] ** 2, rtol=1e-12)
+    np.testing.assert_allclose(lanes["REWARD"], -2.0 * lanes["INPUT_u"] ** 2, rtol=1e-12)
     assert not lanes["INFORMATION_GAIN"].any()
 
 
@@ -251,7 +251,7 @@ def three_steps(**options):
     """Rewards (3, LANES) of steps of 1, 2 and 3 minus a cost of ½; the last step terminates lane 1."""
     lanes, paid = Lanes(reward="fisher"), []
     lanes["ELAPSED_SAMPLES"][:] = HORIZON - 3
-    lanes["INPUT"][:] = 0.1
+    lanes["INPUT_u"][:] = 0.1
     for worth in (1.0, 2.0, 3.0):
         lanes["HOOK_REWARD"][:] = worth
         lanes["Y_y"][1] = 0.7 if worth == 3.0 else 0.0
