@@ -253,8 +253,8 @@ def check_safety_settings(rig: Rig, plant: HardwarePlant, watchdog: float | None
     Raises:
         ValueError: for a rig without limit or range, or a watchdog time for a plant without watchdog.
     """
-    channels = [(channel, "limit", input_key(rig, name)) for name, channel in rig.inputs.items()]
-    for channel, name, side in (*channels, (rig.output, "range", "output")):
+    inputs = [(channel, "limit", "input") for channel in rig.inputs.values()]
+    for channel, name, side in (*inputs, (rig.output, "range", "output")):
         if getattr(channel, name) is None:
             raise ValueError(f"rig must have a {name} of the {side} for a run, but has none; add {side}.{name}")
     if watchdog is not None and not plant.has_watchdog:

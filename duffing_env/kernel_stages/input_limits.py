@@ -52,7 +52,7 @@ def limited_inputs_source(spec: KernelSpec, loop: Any) -> str:
     lines.append(("EXCESS", symbol("ASKED_ENERGY") - symbol("AFFORDABLE")))
     scaled = sp.sqrt(symbol("AFFORDABLE") / symbol("ASKED_ENERGY")) * sp.Float(1.0 - _ENERGY_MARGIN)
     lines.append(("FACTOR", select(is_positive(symbol("EXCESS")), scaled, sp.S.One)))
-    results = {}
+    results: dict[str, str] = {}
     for i in names:
         newest, last, older = (input_history_row(i, age) for age in range(3))
         lines.append((f"APPLIED_{i}", symbol("FACTOR") * symbol(f"ASKED_{i}")))

@@ -108,6 +108,11 @@ class Rig:
             )
         object.__setattr__(self, "guess", _check_guess(self.guess))
 
+    @property
+    def inputs(self) -> dict[str, Channel]:
+        """The input channels, by the names of the model's inputs: a rig has one, ``u``."""
+        return {"u": self.input}
+
     @classmethod
     def silverbox(cls, interpolation: str = "spline", delay: int = 0) -> Rig:
         """The rig of the Silverbox record, with a band-limited input. Online use ``linear`` or ``look_ahead``."""
