@@ -217,7 +217,7 @@ class DuffingVectorEnv(ExperimentEnv, VectorEnv[Observations, npt.NDArray[np.flo
             row, place = np.argwhere(~np.isfinite(actions))[0].tolist()
             raise ValueError(f"actions must be finite, but row {row} is {actions[row, place]}; pass values in [-1, 1]")
         if actions.dtype != np.float32:
-            actions = np.clip(actions, -1.0, 1.0)  # type: ignore[assignment]
+            actions = np.clip(actions, -1.0, 1.0)
         if self._any_needs_reset:
             needs_reset = self._finished if self._autoreset_mode == AutoresetMode.DISABLED else ~self._seeded
             rows = np.flatnonzero(needs_reset).tolist()

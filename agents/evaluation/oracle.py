@@ -90,7 +90,7 @@ class TrackSystems:
         """Limits of the inputs of an episode."""
         experiment = self.experiment
         energy = np.inf if experiment.max_rms is None else experiment.max_rms**2 * experiment.samples
-        return DesignLimits(experiment.max_output, experiment.max_output, experiment.max_input, energy)
+        return DesignLimits(experiment.max_output, experiment.max_output, float(experiment.max_inputs[0]), energy)
 
     @property
     def degree(self) -> int:

@@ -197,7 +197,7 @@ class SampleLoop:
         self._consecutive_lost = self._consecutive_lost + lost if lost == count else lost
         if read_output is not None:
             self._session.check_outputs(np.array([read_output]))
-        self._run_estimator.update([self._last_mean_input, *u[:-1]], y)
+        self._run_estimator.update(np.array([self._last_mean_input, *u[:-1]]), y)
         self._last_mean_input, self._last_output = u[-1], y[-1] if count > 1 or read_output is None else read_output
         self.tick += count
         if self._session.max_stale:

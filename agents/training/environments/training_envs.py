@@ -39,10 +39,10 @@ def make_training_envs(config: TrainConfig, seed: int) -> DuffingVecEnv | Featur
             "train with Stable-Baselines3 on agents.sb3_vec_env.DuffingVecEnv, and pass the model to make_policy",
         )  # fmt: skip
         return envs
-    envs, samples = _feature_envs(config, n, seed)
+    feature_envs, samples = _feature_envs(config, n, seed)
     normaliser_envs, _ = _feature_envs(config, N_NORMALISER_ENVS, config.seed)
-    envs.normalizer.fit(normaliser_envs, samples, config.seed)
-    return envs
+    feature_envs.normalizer.fit(normaliser_envs, samples, config.seed)
+    return feature_envs
 
 
 def _options(config: TrainConfig) -> dict[str, Any]:
