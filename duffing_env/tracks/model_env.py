@@ -11,6 +11,7 @@ import numpy as np
 
 from duffing_env.env import DuffingEnv
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
+from duffing_env.input_options import checked_by_input, numbers_by_input
 from duffing_env.storage.kernel_spec import parameter_names
 from duffing_env.vector_env import DuffingVectorEnv
 from estimator.belief import Belief
@@ -86,7 +87,9 @@ class ModelExperiment(SimulatedExperiment):
         mean = (
             self.mean if isinstance(self.mean, Mapping) and set(self.mean) == set(names) else dict.fromkeys(names, 1.0)
         )
-        limits = dict.fromkeys(list(model.outputs)[:1], self.max_output) | dict.fromkeys(model.inputs, self.max_input)
+        max_inputs = numbers_by_input(checked_by_input("max_input", self.max_input, model), model).tolist()
+        limits = dict.fromkeys(list(model.outputs)[:1], float(self.max_output))
+        limits |= dict(zip(model.inputs, max_inputs, strict=True))
         return model_near_one(model, Scales(self.step), mean, limits)
 
     @property

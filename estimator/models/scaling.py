@@ -1,8 +1,8 @@
 """Models in stated units and seconds, rewritten in numbers near one and in samples.
 
 An expression of the rewritten model has ``size*name`` in place of each name. Sizes of states and coefficients are
-powers of two, so that these products are exact, and the rewritten model computes what the model in its own units would, but for
-overflow.
+powers of two, so that these products are exact, and the rewritten model computes the numbers of the model in its own
+units, but for overflow.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def normals():
     batch = make_batch(500)
     noise = np.empty((2, 250, 500))
     for t in range(noise.shape[1]):
-        batch.step(np.zeros(500))
+        batch.step(np.zeros((500, 1)))
         noise[:, t] = batch.row_values("NOISE_w"), batch.row_values("NOISE_v")
     assert not batch.row_values("NEEDS_RESET").any()
     return noise
@@ -83,7 +83,7 @@ def test_streams_in_blocks_equal_numpy():
         numpy_stream(new_stream_words(np.random.default_rng(child)).view(np.uint64)) for child in spawn_seeds(3, 70)
     ]
     for _ in range(200):
-        batch.step(np.zeros(70))
+        batch.step(np.zeros((70, 1)))
     for row, bits in enumerate(expected):
         bits.random_raw(4 + 2 * 200)  # an oscillator, then two draws a step
         np.testing.assert_array_equal(words_of(batch, row), bits.state["state"]["state"])
