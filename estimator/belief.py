@@ -29,6 +29,18 @@ def covariance_indices(model: Model) -> npt.NDArray[np.intp]:
     return places
 
 
+def couple_initial_states(model: Model, mean: FloatArray, cov: FloatArray) -> None:
+    """Set the states of `Model.initial_states` to their coefficients, in moments (d,) and (d, d), in place.
+
+    Such a state has the coefficient's mean, variance and covariances: before the first sample they are the same number.
+    """
+    for state, coefficient in model.initial_state_coefficients:
+        place = model.n_states + coefficient
+        mean[state] = mean[place]
+        cov[state, :] = cov[place, :]
+        cov[:, state] = cov[:, place]
+
+
 @cache
 def record_size(model: Model) -> int:
     """Number of entries in a record."""

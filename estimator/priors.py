@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief
+from estimator.belief import Belief, couple_initial_states
 from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.models.expression import older_input
@@ -162,7 +162,8 @@ def weak_prior(
         noise_shape: shape of the Gamma priors: 2 is the information of four observed noises. Noises are never observed
             alone, so that even such a prior binds for thousands of samples (docs/evidence/coverage.md): centre it with
             care.
-        state_std: standard deviation of the states about 0: one number, or one for each.
+        state_std: standard deviation of the states about 0: one number, or one for each. States of
+            `Model.initial_states` have the moments of their coefficients.
         scales: units of the parameters.
 
     Raises:
@@ -183,6 +184,7 @@ def weak_prior(
         raise ValueError(f"mean and cov must have shapes {(k,)} and {(k, k)}, but have {[one.shape for one in given]}")
     joint_mean[n:], joint[n:, n:] = given
     joint[:n, :n] = np.diag(np.broadcast_to(np.asarray(state_std, dtype=np.float64) ** 2, n))
+    couple_initial_states(model, joint_mean, joint)
     sensors = np.broadcast_to(np.asarray(measurement_noise, dtype=np.float64), model.n_outputs)
     xi = [(noise_shape, noise_shape * float(std) ** 2) for std in sensors]
     return Belief.of(model, joint_mean, joint, (noise_shape, noise_shape * process_noise**2), xi, scales=scales)

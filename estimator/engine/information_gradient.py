@@ -170,6 +170,7 @@ def with_reverse(
         All assignments, and ``ADJ_<row>`` of each input to the name of its value.
     """
     from estimator.engine import printer_numba, symbolic
+    from estimator.engine.reverse_mode import reverse_mode_derivative
 
     # A result that is a number, a row or the value of another result gets a line of its own, with its own adjoint.
     forward = list(lines)
@@ -182,7 +183,7 @@ def with_reverse(
             copied = symbolic.sp.Float(float(value)) if printer_numba.is_numeral(value) else symbolic.symbol(value)
             forward.append((f"{row}_copy", copied))
             seeds[f"{row}_copy"] = f"ADJ_{row}"
-    back = symbolic.reverse_mode_derivative(forward, inputs, seeds)
+    back = reverse_mode_derivative(forward, inputs, seeds)
     adjoint_before = {f"ADJ_{row}": f"ADJ_BEFORE_{row}" for row in inputs}
     split = len(back) - len(inputs)  # the wanted adjoints come last, and get new names
     ends = [

@@ -204,7 +204,13 @@ class LinearisedFilter:
 
 @cache
 def compile_linearised_filter(
-    model: Model, degree: int = 0, *, follows_outputs: bool, lanes: int = LANES, variable_step: bool = False
+    model: Model,
+    degree: int = 0,
+    *,
+    follows_outputs: bool,
+    lanes: int = LANES,
+    variable_step: bool = False,
+    noise_ratios: bool = False,
 ) -> LinearisedFilter:
     """Compile the linearised filter of a model (`estimator.engine.linearised_filter.linearised_filter_step`).
 
@@ -214,21 +220,23 @@ def compile_linearised_filter(
         follows_outputs: whether the filter is updated by outputs, or follows the noise-free response.
         lanes: lanes of a block.
         variable_step: whether each sample of a differential equation has its own length, in the row ``SAMPLE_LENGTH``.
+        noise_ratios: whether the rows `estimator.engine.storage_layout.noise_ratio_rows` scale the variances of
+            independent noises.
     """
-    layout = linearised_filter_layout(model, degree, follows_outputs, variable_step)
+    layout = linearised_filter_layout(model, degree, follows_outputs, variable_step, noise_ratios)
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic, variational_rk4
         from estimator.engine.linearised_filter import linearised_filter_step
 
-        lines, propagation = symbolic.propagate_sample(model)
+        lines, propagation = symbolic.propagate_sample(model, noise_ratios)
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
         span = symbolic.symbol("SAMPLE_LENGTH") if variable_step else symbolic.ONE
-        source = variational_rk4.print_integrator(model, degree, layout, lanes, sample_length=span)
+        source = variational_rk4.print_integrator(model, degree, layout, lanes, None, span, noise_ratios)
         source += printer_numba.print_lane_loop(
             "finish", lines + more, results, layout, lanes, doc="Predict, and add likelihood and information."
         )
         return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
 
-    key = repr((model.digest, degree, follows_outputs, lanes, variable_step))
+    key = repr((model.digest, degree, follows_outputs, lanes, variable_step, noise_ratios))
     return LinearisedFilter(load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes)

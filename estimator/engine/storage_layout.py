@@ -114,6 +114,17 @@ def n_older_inputs(model: Model, degree: int, lag: int = 0) -> dict[str, int]:
     return dict(zip(model.inputs, oldest, strict=True))
 
 
+def held_noise_rows(model: Model) -> list[list[str]]:
+    """Rows of the state's derivative with respect to each held noise, by source and state."""
+    tags = [f"_{source}" for source in model.noise_sources] if model.independent_noise else [""]
+    return [[f"NOISE_INPUT{tag}_{i}" for i in model.states] for tag in tags] if model.held else []
+
+
+def noise_ratio_rows(model: Model) -> list[str]:
+    """Rows of the ratio of each source's variance to the declared one; none where one source drives all states."""
+    return [f"VARIANCE_RATIO_{source}" for source in model.noise_sources]
+
+
 def integrator_rows(model: Model) -> list[str]:
     """The integrator's quantities in a differential equation: M, F and Q, or NOISE_INPUT where the noise is held.
 
@@ -122,9 +133,9 @@ def integrator_rows(model: Model) -> list[str]:
     if not model.is_continuous:
         return []
     names = [f"M_{i}" for i in model.states] + [f"F_{i}_{j}" for i in model.states for j in model.dynamic_names]
-    return names + (
-        [f"NOISE_INPUT_{i}" for i in model.states] if model.held else upper_triangle_names("Q", model.states)
-    )
+    held = [row for rows in held_noise_rows(model) for row in rows]
+    noise = held if model.held else upper_triangle_names("Q", model.states)
+    return names + noise
 
 
 def update_layout(model: Model, degree: int) -> dict[str, int]:
@@ -173,9 +184,12 @@ def likelihood_total_rows(model: Model) -> list[str]:
 
 
 def linearised_filter_layout(
-    model: Model, degree: int, follows_outputs: bool, variable_step: bool = False
+    model: Model, degree: int, follows_outputs: bool, variable_step: bool = False, noise_ratios: bool = False
 ) -> dict[str, int]:
-    """Rows of the linearised filter's block; ``SAMPLE_LENGTH`` is the length of a sample, if it varies."""
+    """Rows of the linearised filter's block; ``SAMPLE_LENGTH`` is the length of a sample, if it varies.
+
+    With ``noise_ratios``, `noise_ratio_rows` follow the noise variances.
+    """
     seen = [f"{what}_{y}" for what in ("Y", "Y_PRED", "HPH") for y in model.outputs]
     shown = seen if follows_outputs else [*(f"Y_PRED_{y}" for y in model.outputs), "S_PRED"]
     given = [
@@ -185,6 +199,7 @@ def linearised_filter_layout(
         "IS_COUNTED",
         "PROCESS_VARIANCE",
         *(f"R_{y}" for y in model.outputs),
+        *(noise_ratio_rows(model) if noise_ratios else ()),
     ]
     given += ["SAMPLE_LENGTH"] if variable_step else []
     return number_rows(*linearised_filter_rows(model), *likelihood_total_rows(model), *given, *integrator_rows(model))

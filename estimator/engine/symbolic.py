@@ -1,7 +1,8 @@
 """Symbolic differentiation of a model by SymPy, as lists of assignments.
 
 All that the engine compiles is a list of assignments ``(name, expression)`` in the order of execution: the model's
-expressions and derivatives, Runge-Kutta steps, Kalman updates, and the reverse derivative of these. Names of the engine
+expressions and derivatives, Runge-Kutta steps, Kalman updates, and the reverse derivative of these
+(`estimator.engine.reverse_mode`). Names of the engine
 begin with a capital letter:
 
 ==========  ===========================================================================================
@@ -22,7 +23,15 @@ from functools import cache
 import sympy as sp
 
 from estimator.engine.expression_parser import parse_expression
-from estimator.engine.storage_layout import input_row, integrator_rows, stage_input, stage_input_rate, stage_inputs
+from estimator.engine.storage_layout import (
+    held_noise_rows,
+    input_row,
+    integrator_rows,
+    noise_ratio_rows,
+    stage_input,
+    stage_input_rate,
+    stage_inputs,
+)
 from estimator.models.model import Model
 
 Assignments = list[tuple[str, sp.Expr]]
@@ -114,6 +123,29 @@ def differentiate(model: Model) -> ModelDerivatives:
     return ModelDerivatives(moves, jacobian, noise, outputs, output_slopes)
 
 
+def noise_effects(model: Model) -> list[tuple[sp.Expr, ...]]:
+    """Effect g of each source of process noise of unit strength on the states, in `Model.noise_sources` order."""
+    noise = differentiate(model).noise
+    if not model.independent_noise:
+        return [noise]
+    states = list(model.states)
+    return [
+        tuple(effect if state == source else ZERO for state, effect in zip(states, noise, strict=True))
+        for source in model.noise_sources
+    ]
+
+
+def sum_over_sources(
+    model: Model, effects: Sequence[Sequence[sp.Expr]], noise_ratios: bool = False
+) -> tuple[tuple[sp.Expr, ...], ...]:
+    """Σ g gᵀ over the sources' effects g, each times its ``VARIANCE_RATIO_<source>`` if the ratios vary."""
+    ratios = [symbol(row) for row in noise_ratio_rows(model)] if noise_ratios else []
+    weights = ratios or [ONE] * len(effects)
+    n = range(model.n_states)
+    pairs = list(zip(weights, effects, strict=True))
+    return tuple(tuple(sum((w * g[a] * g[b] for w, g in pairs), ZERO) for b in n) for a in n)
+
+
 def eliminate_common_subexpressions(expressions: Mapping[str, sp.Expr], prefix: str) -> Assignments:
     """Assignments of ``expressions`` with common subexpressions assigned first, as ``prefix_0``, ``prefix_1``, ..."""
     symbols = sp.numbered_symbols(f"{prefix}_", real=True)
@@ -144,7 +176,7 @@ class Propagation:
     is_psd: bool = True
 
 
-def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagation]:
+def propagate_difference_equation(model: Model, noise_ratios: bool = False) -> tuple[Assignments, Propagation]:
     """M, F and Q of a difference equation: the next state and its derivatives."""
     c = differentiate(model)
     inputs = {written: input_row(*tap) for written, tap in model.input_ages.items()}
@@ -160,7 +192,7 @@ def propagate_difference_equation(model: Model) -> tuple[Assignments, Propagatio
     jacobian = tuple(
         tuple(value(f"F_{i}_{j}") if is_dynamic[j] else sp.S.Zero for j in model.names) for i in model.states
     )
-    noise = tuple(tuple(a * b for b in c.noise) for a in c.noise)
+    noise = sum_over_sources(model, noise_effects(model), noise_ratios)
     return lines, Propagation(tuple(value(f"M_{i}") for i in model.states), jacobian, noise)
 
 
@@ -172,22 +204,30 @@ def integrator_start(model: Model) -> dict[str, sp.Expr]:
     return start
 
 
-def integrator_end(model: Model) -> Propagation:
+def integrator_end(model: Model, noise_ratios: bool = False) -> Propagation:
     """The dynamics over a sample, from the integrator's quantities at its end."""
     states = list(model.states)
     jacobian = tuple(
         tuple(symbol(f"F_{i}_{j}") if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states
     )
     if model.held:
-        noise = tuple(tuple(symbol(f"NOISE_INPUT_{i}") * symbol(f"NOISE_INPUT_{k}") for k in states) for i in states)
+        columns = [[symbol(row) for row in rows] for rows in held_noise_rows(model)]
+        noise = sum_over_sources(model, columns, noise_ratios)
     else:
         noise = tuple(tuple(symmetric_entry("Q", i, k, states) for k in states) for i in states)
     return Propagation(tuple(symbol(f"M_{i}") for i in states), jacobian, noise, is_psd=model.held)
 
 
-def propagate_sample(model: Model) -> tuple[Assignments, Propagation]:
-    """The assignments at the end of a sample, and the dynamics over it."""
-    return ([], integrator_end(model)) if model.is_continuous else propagate_difference_equation(model)
+def propagate_sample(model: Model, noise_ratios: bool = False) -> tuple[Assignments, Propagation]:
+    """The assignments at the end of a sample, and the dynamics over it.
+
+    Args:
+        model: the equation.
+        noise_ratios: whether the rows `estimator.engine.storage_layout.noise_ratio_rows` scale the sources' variances.
+    """
+    if model.is_continuous:
+        return [], integrator_end(model, noise_ratios)
+    return propagate_difference_equation(model, noise_ratios)
 
 
 def runge_kutta_4(
@@ -309,36 +349,3 @@ def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tup
     return substitute(lines, row_of), results
 
 
-def reverse_mode_derivative(
-    assignments: Assignments, inputs: Sequence[str], result_adjoints: Mapping[str, str]
-) -> Assignments:
-    """Reverse-mode differentiation of assignments: adjoints ``ADJ_<name>`` of ``inputs``.
-
-    Args:
-        assignments: forward, each name assigned once.
-        inputs: names whose adjoints are wanted.
-        result_adjoints: result to the name of its adjoint.
-
-    Returns:
-        Assignments to execute after the forward ones; the adjoints of ``inputs`` come last.
-
-    Raises:
-        ValueError: for a name that is assigned twice.
-    """
-    if len({name for name, _ in assignments}) < len(assignments):
-        raise ValueError("assignments must assign every name once for the reverse derivative; rename the second")
-    adjoints: dict[str, list[sp.Expr]] = {name: [symbol(seed)] for name, seed in result_adjoints.items()}
-    lines: Assignments = []
-    for name, expression in reversed(assignments):
-        parts = adjoints.pop(name, None)
-        if parts is None:
-            continue
-        adjoint = symbol(f"ADJ_{name}")
-        lines.append((str(adjoint), sum(parts, sp.S.Zero)))
-        inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
-        for used in sorted(expression.free_symbols, key=str):
-            # The slope of 1/x is -(1/x)², without another division.
-            slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
-            adjoints.setdefault(str(used), []).append(slope * adjoint)
-    lines += [(f"ADJ_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]
-    return lines

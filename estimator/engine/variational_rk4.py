@@ -19,14 +19,16 @@ from typing import Any
 import sympy as sp
 
 from estimator.engine import printer_numba, symbolic
-from estimator.engine.storage_layout import integrator_rows, stage_inputs, upper_triangle_names
+from estimator.engine.storage_layout import held_noise_rows, integrator_rows, stage_inputs, upper_triangle_names
 from estimator.engine.symbolic import (
     Assignments,
     Program,
     differentiate,
     eliminate_common_subexpressions,
     input_at_stages,
+    noise_effects,
     runge_kutta_4,
+    sum_over_sources,
     symbol,
     symmetric_entry,
 )
@@ -45,7 +47,7 @@ _COARSE_STEPS, _MIN_COARSE_STEPS = 4, 2
 #: Runge-Kutta steps over a predicted sample, for all other models.
 _MIN_COARSE_STEPS = 2
 
-#: Name of the held process noise, which has a column of sensitivities as a coefficient has.
+#: Name of a held process noise, which has a column of sensitivities as a coefficient has, before its source's number.
 _HELD_NOISE = "HELD"
 
 _Slopes = dict[tuple[str, str], sp.Expr]
@@ -58,6 +60,7 @@ def print_integrator(
     lanes: int,
     input_values: Mapping[str, Any] | None = None,
     sample_length: sp.Expr = sp.S.One,
+    noise_ratios: bool = False,
 ) -> str:
     """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample.
 
@@ -68,12 +71,13 @@ def print_integrator(
         lanes: lanes of the block.
         input_values: ``U_<input>_<k>`` to an expression in other rows.
         sample_length: length of the sample, in sampling steps.
+        noise_ratios: as for `estimator.engine.symbolic.propagate_sample`.
     """
     if not model.is_continuous:
         return ""
     start = {name: printer_numba.print_expression(value) for name, value in symbolic.integrator_start(model).items()}
     stepped = {name: f"{name}_END" for name in integrator_rows(model)}
-    step = symbolic.substitute(variational_rk4_step(model, degree, sample_length), input_values or {})
+    step = symbolic.substitute(variational_rk4_step(model, degree, sample_length, noise_ratios), input_values or {})
     source = printer_numba.print_lane_loop(
         "begin", [], start, layout, lanes, doc="The integrator at the start of a sample."
     )
@@ -81,10 +85,13 @@ def print_integrator(
     return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("TAU",), doc)
 
 
-def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.S.One) -> Assignments:
+def variational_rk4_step(
+    model: Model, degree: int, sample_length: sp.Expr = sp.S.One, noise_ratios: bool = False
+) -> Assignments:
     """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_END``."""
     states, h = list(model.states), sample_length * sp.Rational(1, model.substeps)
-    stage, slopes = _stage_rates_and_slopes(model)
+    stage, slopes = _stage_rates_and_slopes(model, noise_ratios)
+    held_columns = {f"{_HELD_NOISE}{s}": rows for s, rows in enumerate(held_noise_rows(model))}
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
     lines = Program(
         input_at_stages(model, degree, model.substeps)
@@ -109,13 +116,14 @@ def variational_rk4_step(model: Model, degree: int, sample_length: sp.Expr = sp.
         for k in states:
             total[i, k] = lines.assign(f"F_STEP_{i}_{k}", total[i, k] + (1 if i == k else 0))
     for i, j in slopes:
-        columns = {k: symbol(f"NOISE_INPUT_{k}" if j == _HELD_NOISE else f"F_{k}_{j}") for k in states}
+        names = held_columns.get(j) or [f"F_{k}_{j}" for k in states]
+        columns = dict(zip(states, map(symbol, names), strict=True))
         column = sum((total[i, k] * columns[k] for k in states), sp.S.Zero)
         lines.append((f"{columns[i]}_END", column if j in states else column + total[i, j]))
     return lines
 
 
-def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
+def _stage_rates_and_slopes(model: Model, noise_ratios: bool = False) -> tuple[Assignments, _Slopes]:
     """Rates ``RATE_<name>`` of the state and its noise covariance, and the Jacobian of the state's rates.
 
     Entries of the Jacobian that differ between the stages are assigned too, as ``J_<state>_<quantity>``.
@@ -125,10 +133,12 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
     n = len(states)
     named = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(states, c.moves, strict=True)}
     jacobian = [[slope.xreplace(at) for slope in row] for row in c.jacobian]
-    noise = [e.xreplace(at) for e in c.noise]
+    effects = [[e.xreplace(at) for e in effect] for effect in noise_effects(model)]
+    noise = sum_over_sources(model, effects, noise_ratios)
     slopes = {(i, j): jacobian[a][b] for b, j in enumerate(model.dynamic_names) for a, i in enumerate(states)}
     if model.held:
-        slopes |= {(i, _HELD_NOISE): noise[a] for a, i in enumerate(states)}
+        for s, effect in enumerate(effects):
+            slopes |= {(i, f"{_HELD_NOISE}{s}"): effect[a] for a, i in enumerate(states)}
     changing = {*map(symbol, model.acting_inputs), *at.values()}
     named |= {f"J_{i}_{j}": slope for (i, j), slope in slopes.items() if slope.free_symbols & changing}
     for a in range(n):
@@ -138,7 +148,7 @@ def _stage_rates_and_slopes(model: Model) -> tuple[Assignments, _Slopes]:
                 + jacobian[b][k] * symmetric_entry("Q", states[k], states[a], states)
                 for k in range(n)
             )
-            named[f"RATE_Q_{states[a]}_{states[b]}"] = noise_rate + noise[a] * noise[b]
+            named[f"RATE_Q_{states[a]}_{states[b]}"] = noise_rate + noise[a][b]
     return eliminate_common_subexpressions(named, "CSE"), slopes
 
 
@@ -164,7 +174,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
     """M, F and Q of a predicted sample of a differential equation, along `coarse_trajectory`.
 
     The sensitivities take one step, with the Jacobians at the start, middle and end of the sample. With H of its stages
-    and g the coefficient of unit noise in the rates, Q follows Simpson's rule:
+    and g the coefficient of unit noise in the rates, Q follows Simpson's rule, summed over the sources:
 
         Q = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
@@ -172,12 +182,12 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
     lines = Program(symbolic.substitute(input_at_stages(model, degree, 1), {"TAU": sp.S.Zero}))
     points = {tag: {i: symbol(f"{at}{i}") for i in states} for tag, at in (("A", ""), ("B", "MIDDLE_"), ("D", "END_"))}
     end = {symbol(i): value for i, value in points["D"].items()}
-    noise = [g.xreplace(end) for g in differentiate(model).noise]
+    effects = [[g.xreplace(end) for g in effect] for effect in noise_effects(model)]
     slopes = {tag: _slopes_at(model, tag, point, lines) for tag, point in points.items()}
     slopes["C"] = slopes["B"]
     stage_slopes: _Slopes = {}
     total: _Slopes = dict.fromkeys(slopes["A"], sp.S.Zero)
-    noise_slopes: dict[str, list[sp.Expr]] = {}
+    noise_slopes: dict[str, list[list[sp.Expr]]] = {}
     for tag in "DCBA":
         counts, reach = _STAGE_WEIGHTS[tag]
         H = {}
@@ -189,24 +199,37 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
             product = sum((H[i, k] * slopes[tag][k, j] for k in states), sp.S.Zero)
             stage_slopes[i, j] = lines.assign(f"END_BY_STATE_{i}_{j}_{tag}", product) if j in states else product
             total[i, j] += stage_slopes[i, j]
-        noise_slopes[tag] = [sum((H[i, k] * g for k, g in zip(states, noise, strict=True)), sp.S.Zero) for i in states]
+        noise_slopes[tag] = [
+            [sum((H[i, k] * g for k, g in zip(states, effect, strict=True)), sp.S.Zero) for i in states]
+            for effect in effects
+        ]
     jacobian = {(i, j): lines.assign(f"F_{i}_{j}", total[i, j] + (1 if i == j else 0)) for i, j in total}
-    noise_slopes["B"] = [b + c for b, c in zip(noise_slopes["B"], noise_slopes["C"], strict=True)]
+    noise_slopes["B"] = [
+        [b + c for b, c in zip(*columns, strict=True)]
+        for columns in zip(noise_slopes["B"], noise_slopes["C"], strict=True)
+    ]
     simpson_weights = {"A": sp.Integer(6), "B": sp.Rational(3, 2), "D": sp.Integer(6)}
     noise_slopes = {
-        tag: [lines.assign(f"NOISE_EFFECT_{i}_{tag}", k) for i, k in zip(states, noise_slopes[tag], strict=True)]
+        tag: [
+            [lines.assign(f"NOISE_EFFECT{s}_{i}_{tag}", k) for i, k in zip(states, column, strict=True)]
+            for s, column in enumerate(noise_slopes[tag])
+        ]
         for tag in simpson_weights
     }
+    held_effects = [[jacobian[i, f"{_HELD_NOISE}{s}"] for i in states] for s in range(len(effects) * model.held)]
+    held_cov = sum_over_sources(model, held_effects)
     noise_cov = {}
     for a, i in enumerate(states):
         for b, k in enumerate(states[a:], a):
             value = sum(
-                (share * noise_slopes[tag][a] * noise_slopes[tag][b] for tag, share in simpson_weights.items()),
+                (
+                    share * column[a] * column[b]
+                    for tag, share in simpson_weights.items()
+                    for column in noise_slopes[tag]
+                ),
                 sp.S.Zero,
             )
-            noise_cov[i, k] = noise_cov[k, i] = lines.assign(
-                f"Q_{i}_{k}", jacobian[i, _HELD_NOISE] * jacobian[k, _HELD_NOISE] if model.held else value
-            )
+            noise_cov[i, k] = noise_cov[k, i] = lines.assign(f"Q_{i}_{k}", held_cov[a][b] if model.held else value)
     return lines, symbolic.Propagation(
         tuple(points["D"].values()),
         tuple(tuple(jacobian[i, j] if j in model.dynamic_names else sp.S.Zero for j in model.names) for i in states),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from estimator.belief import Belief, check_belief_record, covariance_indices
+from estimator.belief import Belief, check_belief_record, couple_initial_states, covariance_indices
 from estimator.inference import filter_loop
 from estimator.inference.input_interpolation import InputStencil, input_stencil, rig_input_degree
 from estimator.inference.noise_grid import (
@@ -147,10 +147,15 @@ class Filter:
     def rewind(self) -> None:
         """Reset the state and the inputs; keep coefficients, noises and weights."""
         records, n = self.records, self.model.n_states
-        of_states = np.concatenate([np.arange(n), covariance_indices(self.model)[:n].reshape(-1)])
+        places = covariance_indices(self.model)
+        of_states = np.concatenate([np.arange(n), places[:n].reshape(-1)])
         records[:, of_states] = self._first[of_states]
-        coupled = covariance_indices(self.model)[:n, n:].reshape(-1)
+        coupled = places[:n, n:].reshape(-1)
         records[:, coupled] = 0.0
+        for record in records if self.model.initial_states else ():
+            mean, cov = record[: len(places)], record[places]
+            couple_initial_states(self.model, mean, cov)
+            record[places] = cov
         self._write_records(records)
         self._inputs[:], self._outputs[:], self._begun[:] = 0.0, 0.0, 0.0
 
@@ -227,6 +232,7 @@ class Filter:
         if state is None:
             record[:n] = self._first[:n]
             cov[:n, :n] = self._first[places[:n, :n]]
+            couple_initial_states(self.model, record[:d], cov)
         else:
             record[:n] = state
         record[places] = cov

@@ -11,6 +11,8 @@ to signal (1e-5 on the tracks), and information from S requires exactly known no
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 
@@ -33,6 +35,7 @@ def fisher_information(
     y: npt.ArrayLike | None = None,
     interpolation: str = "zero_order",
     state_std: float = 0.0,
+    process_ratios: Mapping[str, npt.ArrayLike] | None = None,
 ) -> FloatArray:
     """Fisher information of a model's coefficients in its outputs, under given inputs.
 
@@ -47,7 +50,9 @@ def fisher_information(
         y: (T,) or (n, T) outputs, or (..., T, p) of p sensors: the linearisation is then along the filter's trajectory
             on them. None is along the noise-free response, for experiment design.
         interpolation: of the input between samples: ``zero_order``, or ``linear`` for a differential equation.
-        state_std: standard deviation of every state about 0 at the start; by default it starts at rest.
+        state_std: standard deviation of every state about 0 at the start; by default it starts at rest. States of
+            `Model.initial_states` start at their coefficients.
+        process_ratios: state with independent noise to the factor on its strength, 1 by default; (n,) of a batch.
 
     Returns:
         (K, K), or (n, K, K) where an argument is a batch. Not finite where the model blows up.
@@ -56,7 +61,7 @@ def fisher_information(
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
     degree = input_degree(Model.require_model(model), interpolation)
-    noises = noise_variances(model, process_noise, measurement_noise)
+    noises = noise_variances(model, process_noise, measurement_noise, process_ratios)
     check_number("state_std", state_std, 0, MAX_MAGNITUDE, "0 is at rest")
     points, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
     if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
@@ -84,7 +89,7 @@ def fisher_information(
         broadcast(points, model.n_coefficients),
         inputs_by_sample(model, broadcast(inputs, samples), degree),
         None if outputs is None else broadcast(outputs, samples, model.n_outputs),
-        broadcast(noises, 1 + model.n_outputs),
+        broadcast(noises, noises.shape[-1]),
         covariance,
     )
     k = model.n_coefficients

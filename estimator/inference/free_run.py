@@ -33,7 +33,7 @@ def free_run(
         coefficients: (K,) or (S, K), time counted in samples.
         u: (T,) or (S, T) inputs; the t-th acts over the sample that ends with the t-th output. Before the first the
             input is 0.
-        state: (n,) or (S, n) initial state; None is at rest.
+        state: (n,) or (S, n) initial state; None is at rest, or at the coefficients of `Model.initial_states`.
         interpolation: interpolation of the input between samples: ``zero_order``, or ``linear`` for a differential
             equation.
 
@@ -54,6 +54,8 @@ def free_run(
         )
     starts = np.empty((*systems, model.n_states + model.n_coefficients))
     starts[..., : model.n_states], starts[..., model.n_states :] = start, values
+    for place, coefficient in model.initial_state_coefficients if state is None else ():
+        starts[..., place] = values[..., coefficient]
     inputs = np.broadcast_to(inputs, (*systems, inputs.shape[-1])).copy()
     outputs = np.empty_like(inputs)
     run, _ = _compile_free_run(model, input_degree(model, interpolation))

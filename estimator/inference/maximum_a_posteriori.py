@@ -12,7 +12,7 @@ far from the truth. The inverse of Λ0 + F at the minimum is the covariance of L
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,8 +71,9 @@ def maximum_a_posteriori(
     measurement_noise: npt.ArrayLike,
     interpolation: str = "zero_order",
     starts: Sequence[FloatArray] = (),
+    process_ratios: Mapping[str, npt.ArrayLike] | None = None,
 ) -> MapEstimate:
-    """Fit a model's coefficients to whole records, each from rest.
+    """Fit a model's coefficients to whole records, each from rest, or from `Model.initial_states`.
 
     Model, noises and interpolation are as `estimator.inference.fisher_information.fisher_information` takes them.
 
@@ -87,6 +88,7 @@ def maximum_a_posteriori(
         interpolation: interpolation of the input between samples.
         starts: further starting points, each (n, K) coefficients; the fit with the smallest L is kept for each record.
             A start that is not finite is ignored.
+        process_ratios: state with independent noise to the factor on its strength, 1 by default; (n,) of each record.
 
     Raises:
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
@@ -95,7 +97,7 @@ def maximum_a_posteriori(
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
     outputs = np.array(outputs_by_sensor(model, inputs, y))
-    noises = noise_variances(model, process_noise, measurement_noise)
+    noises = noise_variances(model, process_noise, measurement_noise, process_ratios)
     sample_inputs = inputs_by_sample(model, inputs, input_degree(model, interpolation))
     center, cov = prior.coefficients_mean, prior.coefficients_cov
     if center.shape != (model.n_coefficients,):

@@ -5,6 +5,7 @@ The records run side by side in SIMD lanes. `estimator.engine.linearised_filter`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from estimator.engine.kernels import compile_linearised_filter
 from estimator.engine.storage_layout import first_input_row, known_inputs, likelihood_total_rows
 from estimator.inference.input_interpolation import record_lengths
 from estimator.models.model import MAX_INPUT_AGE, Model
-from estimator.support.argument_checks import to_float_array
+from estimator.support.argument_checks import check_mapping, to_float_array
 from estimator.support.array_types import FloatArray
 
 
@@ -65,30 +66,31 @@ def record_likelihoods(
     initial_state: FloatArray | float = 0.0,
     sample_lengths: FloatArray | None = None,
     forecasts: FloatArray | None = None,
+    initial_state_slopes: FloatArray | None = None,
 ) -> RecordLikelihoods:
     """Run the linearised Kalman filter over n series.
+
+    States of `Model.initial_states` begin at their coefficients, without variance, whatever the other arguments say.
 
     Args:
         model: the equation.
         coefficients: (n, K) coefficients.
         inputs: (n, T, rows) inputs of each sample (`inputs_by_sample`); a series ends before its first NaN.
         y: (n, T, p) outputs, NaN where one is missing; None for the noise-free response.
-        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor.
+        noises: (1 + p,) or (n, 1 + p) variances of the process noise and of each sensor; then, of a model with
+            independent noise, the ratio of each source's variance to the declared one (`noise_variances`).
         initial_state_cov: (n_states, n_states) covariance of the states at the start.
         initial_state: (n, n_states) mean of the states at the start; 0 is at rest.
         sample_lengths: (n, T) length of each sample of a differential equation, in sampling steps; None for all 1.
         forecasts: (n, T, p, 2) receives the predictive mean and variance of each output.
+        initial_state_slopes: (n, n_states, K) derivatives of ``initial_state`` by the coefficients; None for all 0.
     """
     k = model.n_coefficients
     lengths = record_lengths(inputs[:, :, 0])
     totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
-    initial_moments = np.empty((len(inputs), model.n_states + (model.n_states * (model.n_states + 1)) // 2))
-    initial_moments[:, : model.n_states], initial_moments[:, model.n_states :] = (
-        initial_state,
-        initial_state_cov[_upper_triangle(model.n_states)],
-    )
+    initial_moments = _initial_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
     outputs = np.zeros((0, 0, 0)) if y is None else y
-    noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs)).copy()
+    noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
     degree = inputs.shape[2] - 1 if model.is_continuous else 0
     variable_step = sample_lengths is not None
     lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
@@ -99,6 +101,31 @@ def record_likelihoods(
     upper = _upper_triangle(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
     return RecordLikelihoods(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
+
+
+def _initial_moments(
+    model: Model,
+    coefficients: FloatArray,
+    initial_state_cov: FloatArray,
+    initial_state: FloatArray | float,
+    slopes: FloatArray | None,
+) -> FloatArray:
+    """(n, rows) mean, packed covariance and, where there are slopes, sensitivities of the states at the start."""
+    n, moments = model.n_states, model.n_states + model.n_states * (model.n_states + 1) // 2
+    has_slopes = slopes is not None or bool(model.initial_states)
+    begin = np.zeros((len(coefficients), moments + n * model.n_coefficients * has_slopes))
+    begin[:, :n] = initial_state
+    cov = initial_state_cov.copy()
+    if has_slopes:
+        sensitivities = begin[:, moments:].reshape(len(begin), n, model.n_coefficients)
+        sensitivities[:] = 0.0 if slopes is None else slopes
+        for state, coefficient in model.initial_state_coefficients:
+            begin[:, state] = coefficients[:, coefficient]
+            cov[state, :] = cov[:, state] = 0.0
+            sensitivities[:, state] = np.arange(model.n_coefficients) == coefficient
+        begin[:, moments:] = sensitivities.reshape(len(begin), -1)
+    begin[:, n:moments] = cov[_upper_triangle(n)]
+    return begin
 
 
 #: (rows, columns) of the upper triangle of a square matrix.
@@ -115,9 +142,9 @@ class _RowOffsets(NamedTuple):
     """Sizes of the loop's quantities, and their first rows in the block; -1 for a row that is not there.
 
     Attributes:
-        n_state_moments: means and covariances of the states.
         n_coefficients: coefficients.
         n_outputs: sensors.
+        n_noises: noises of `record_likelihoods`.
         n_totals: rows of `RecordLikelihoods`.
         coefficient: first coefficient.
         noise: variance of the process noise; the sensors' follow.
@@ -130,9 +157,9 @@ class _RowOffsets(NamedTuple):
         predicted_variance: its variance without sensor noise.
     """
 
-    n_state_moments: int
     n_coefficients: int
     n_outputs: int
+    n_noises: int
     n_totals: int
     coefficient: int
     noise: int
@@ -159,9 +186,9 @@ def _load_records(W, at, first, lanes, coefficients, lengths, initial_moments, n
         W[at.is_counted * _FIT_LANES + j] = 1.0
         for c in range(at.n_coefficients):
             W[(at.coefficient + c) * _FIT_LANES + j] = coefficients[i, c]
-        for c in range(at.n_state_moments):
+        for c in range(initial_moments.shape[1]):
             W[c * _FIT_LANES + j] = initial_moments[i, c]
-        for c in range(1 + at.n_outputs):
+        for c in range(at.n_noises):
             W[(at.noise + c) * _FIT_LANES + j] = noises[i, c]
     return longest
 
@@ -209,14 +236,19 @@ def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
 def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
     """Compile the loop of `record_likelihoods`, with totals (n, 2 + K + K (K + 1)/2) packed."""
     linearised_filter = compile_linearised_filter(
-        model, degree, follows_outputs=follows_outputs, lanes=_FIT_LANES, variable_step=variable_step
+        model,
+        degree,
+        follows_outputs=follows_outputs,
+        lanes=_FIT_LANES,
+        variable_step=variable_step,
+        noise_ratios=model.independent_noise,
     )
     sample, rows, size = linearised_filter.sample, linearised_filter.layout, len(linearised_filter.layout)
-    n, sensor = model.n_states, next(iter(model.outputs))
+    sensor = next(iter(model.outputs))
     at = _RowOffsets(
-        n_state_moments=n + n * (n + 1) // 2,
         n_coefficients=model.n_coefficients,
         n_outputs=model.n_outputs,
+        n_noises=1 + model.n_outputs + len(model.noise_sources),
         n_totals=len(likelihood_total_rows(model)),
         coefficient=rows[next(iter(model.coefficients))],
         noise=rows["PROCESS_VARIANCE"],
@@ -242,17 +274,45 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
     return run
 
 
-def noise_variances(model: Model, process_noise: npt.ArrayLike, measurement_noise: npt.ArrayLike) -> FloatArray:
-    """(1 + p,) variances of the process noise and of each sensor, from standard deviations; (n, 1 + p) of a batch.
+def noise_variances(
+    model: Model,
+    process_noise: npt.ArrayLike,
+    measurement_noise: npt.ArrayLike,
+    process_ratios: Mapping[str, npt.ArrayLike] | None = None,
+) -> FloatArray:
+    """Variances of the process noise and of each sensor from standard deviations, for `record_likelihoods`.
+
+    Args:
+        model: the equation.
+        process_noise: standard deviation of the process noise; (n,) of a batch.
+        measurement_noise: the sensors' standard deviations: one number, or one for each; (n, p) of a batch.
+        process_ratios: state with independent noise to the factor on its strength, 0 or more; (n,) of a batch.
+            Others have 1.
+
+    Returns:
+        (1 + p + sources,), or (n, 1 + p + sources) of a batch; the last are the squared ratios of
+        `Model.noise_sources`.
 
     Raises:
-        ValueError: for a value out of range, or another number of sensors than the model has.
+        ValueError: for a value out of range, ratios of other states, or another number of sensors than the model has.
     """
-    process = to_float_array("process_noise", process_noise)
-    if process.ndim > 1 or not (np.all(process >= 0) and np.isfinite(process).all()):
+    ratios = {} if process_ratios is None else process_ratios
+    check_mapping("process_ratios", ratios)
+    unknown = sorted(set(ratios).difference(model.noise_sources))
+    if unknown:
         raise ValueError(
-            f"process_noise must be 0 or more and finite, but is {process_noise!r}; pass a standard deviation"
+            f"process_ratios must be of states with independent noise, {list(model.noise_sources)}, but have {unknown};"
+            f" declare the model with independent_noise=True"
         )
+    given = {"process_noise": process_noise}
+    given |= {f"process_ratios[{state!r}]": ratios.get(state, 1.0) for state in model.noise_sources}
+    columns = [to_float_array(name, value) for name, value in given.items()]
+    for (name, value), column in zip(given.items(), columns, strict=True):
+        if column.ndim > 1 or not (np.all(column >= 0) and np.isfinite(column).all()):
+            raise ValueError(
+                f"{name} must be 0 or more and finite, but is {value!r}; pass a standard deviation"
+                f"{'' if name == 'process_noise' else ' in parts of the declared one'}"
+            )
     stds = to_float_array("measurement_noise", measurement_noise)
     if stds.ndim > 2 or (stds.ndim and stds.shape[-1] != model.n_outputs):
         raise ValueError(
@@ -264,14 +324,15 @@ def noise_variances(model: Model, process_noise: npt.ArrayLike, measurement_nois
             f"measurement_noise must be positive and finite, but is {stds.tolist()}; pass a standard deviation"
         )
     try:
-        shape = np.broadcast_shapes(process.shape, stds.shape[:-1])
+        shape = np.broadcast_shapes(*(column.shape for column in columns), stds.shape[:-1])
     except ValueError:
-        sizes = process.shape, stds.shape[:-1]
+        sizes = [column.shape for column in columns], stds.shape[:-1]
         raise ValueError(
             f"process_noise and measurement_noise must be batches of one size, but have {sizes}; repeat the smaller"
         ) from None
     sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
-    return np.concatenate([np.broadcast_to(process, shape)[..., None], sensors], axis=-1) ** 2
+    process, *sources = (np.broadcast_to(column, shape)[..., None] for column in columns)
+    return np.concatenate([process, sensors, *sources], axis=-1) ** 2
 
 
 def outputs_by_sensor(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:

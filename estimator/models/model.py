@@ -11,7 +11,7 @@ import json
 import keyword
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 
 from estimator.models.expression import (
@@ -49,7 +49,9 @@ DEFAULT_INPUTS = {"u": ""}
 MAX_INPUT_AGE = 2
 
 #: Fields that came later, with the values at which they are left out of the digest: oracles are named by it.
-_LATER_FIELDS: dict[str, object] = {"inputs": DEFAULT_INPUTS, "constants": {}, "time": "sample"}
+_LATER_FIELDS: dict[str, object] = {
+    "inputs": DEFAULT_INPUTS, "constants": {}, "time": "sample", "independent_noise": False, "initial_states": {},
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +71,8 @@ class Model:
         states: state to unit.
         coefficients: coefficient to unit; all are unknown and constant, or drift slowly where an estimator assumes it.
         noise: per state, the effect of process noise of unit strength: for rates, the root of its white intensity, or a
-            force that is constant over a sample where ``held``; for a next state, the added noise.
+            force that is constant over a sample where ``held``; for a next state, the added noise. One source drives
+            all states, or with ``independent_noise`` each has its own.
         outputs: sensor to its measured quantity, without sensor noise; at least one. The strength of the process noise
             is its effect on the first sensor within one sample.
         inputs: input to unit, in the order of arrays and actions; ``{}`` has none. The default is one input, ``u``.
@@ -86,6 +89,10 @@ class Model:
         time: unit of time in rates and noise: ``sample``; or ``s``, where all numbers are in the stated units, and the
             noise is the root of a white intensity per second. `estimator.rigs.stated_units` makes a prior and a scaled
             model of it.
+        independent_noise: whether each state has process noise of its own, independent of the others'. The expressions
+            in ``noise`` are then the ratios of the strengths, which one unknown factor scales (`with_noise_ratios`).
+        initial_states: state to the coefficient that is its unknown value before the first sample; the others begin
+            near rest. Such a coefficient may occur in no expression.
 
     Raises:
         ValueError: naming the argument, for a name that is not a lower-case identifier or occurs twice, expressions
@@ -115,9 +122,11 @@ class Model:
     inverse: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
     time: str = "sample"
+    independent_noise: bool = False
+    initial_states: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse"):
+        for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse", "initial_states"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
         check_choice("time", self.time, ("sample", "s"))
@@ -138,6 +147,7 @@ class Model:
         if not isinstance(self.name, str):
             raise ValueError(f"name must be a text, but is {short_repr(self.name)}")
         check_bool("held", self.held)
+        check_bool("independent_noise", self.independent_noise)
         check_integer("substeps", self.substeps, 1000)
         for field_name, powers in self.dimensions.items():
             if isinstance(powers, str):
@@ -190,9 +200,17 @@ class Model:
                 f"physical and inverse go together, and inverse must give {list(self.coefficients)}, but gives "
                 f"{list(self.inverse)}"
             )
+        for state, coefficient in self.initial_states.items():
+            if state not in self.states or coefficient not in self.coefficients:
+                raise ValueError(
+                    f"initial_states must give a state of {list(self.states)} a coefficient of "
+                    f"{list(self.coefficients)}, but has {state!r}: {coefficient!r}"
+                )
         self._validate_expressions()
         # In the order of the names, whatever the order in which they are written.
         object.__setattr__(self, "dimensions", {name: self.dimensions[name] for name in self.physical})
+        by_state = {name: self.initial_states[name] for name in self.states if name in self.initial_states}
+        object.__setattr__(self, "initial_states", by_state)
         if self.inverse:
             object.__setattr__(self, "inverse", {name: self.inverse[name] for name in self.coefficients})
 
@@ -209,7 +227,8 @@ class Model:
                 raise ValueError(f"outputs must show a state or a coefficient each, but {sensor!r} shows none")
         motion_names = [names_in_expression(text, known, self.name) for text in self.update_expressions]
         noise_names = [names_in_expression(text, (*self.names, *self.constants), self.name) for text in self.noise]
-        unused = sorted(set(self.coefficients).difference(*output_names, *motion_names, *noise_names))
+        used_at_start = set(self.initial_states.values())
+        unused = sorted(set(self.coefficients).difference(used_at_start, *output_names, *motion_names, *noise_names))
         if unused:
             raise ValueError(
                 f"coefficients must stand in an expression, but {unused} do not; use them, or leave them out"
@@ -288,11 +307,51 @@ class Model:
         return (*self.states, *(name for name in self.coefficients if name in used))
 
     @cached_property
+    def noise_sources(self) -> tuple[str, ...]:
+        """The states with process noise of their own; empty where one source drives all states."""
+        pairs = zip(self.states, self.noise, strict=True)
+        return tuple(state for state, text in pairs if text.strip() != "0") if self.independent_noise else ()
+
+    @cached_property
+    def initial_state_coefficients(self) -> tuple[tuple[int, int], ...]:
+        """Places (state, coefficient) of ``initial_states``."""
+        states, coefficients = list(self.states), list(self.coefficients)
+        return tuple((states.index(state), coefficients.index(c)) for state, c in self.initial_states.items())
+
+    def with_noise_ratios(self, ratios: Mapping[str, float]) -> Model:
+        """This model with the process noise of some states scaled.
+
+        Args:
+            ratios: state to the positive factor on its standard deviation; the others keep theirs.
+
+        Raises:
+            ValueError: for a model whose states share one source, a state without noise, or a factor out of range.
+        """
+        check_mapping("ratios", ratios)
+        unknown = sorted(set(ratios).difference(self.noise_sources))
+        if unknown:
+            raise ValueError(
+                f"ratios must be of states with independent noise, {list(self.noise_sources)}, but have {unknown}; "
+                "declare the model with independent_noise=True"
+            )
+        for state, ratio in ratios.items():
+            check_number(f"ratios of {state}", ratio, 1e-30, 1e30)
+        pairs = zip(self.states, self.noise, strict=True)
+        noise = tuple(f"{float(ratios[state])!r}*({text})" if state in ratios else text for state, text in pairs)
+        return replace(self, noise=noise)
+
+    def _described_fields(self) -> dict[str, object]:
+        """The fields by name, without cached properties, and without later additions at their defaults.
+
+        So neither the digest nor a file of a model that does not use them changes.
+        """
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {key: value for key, value in values.items() if key not in _LATER_FIELDS or value != _LATER_FIELDS[key]}
+
+    @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits that identify the model."""
-        # The fields alone, without cached properties.
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        values = {key: v for key, v in values.items() if key not in _LATER_FIELDS or v != _LATER_FIELDS[key]}
+        values = self._described_fields()
         text = json.dumps({key: dict(v) if isinstance(v, Mapping) else v for key, v in values.items()})
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -315,4 +374,5 @@ class Model:
 
     def to_dict(self) -> dict[str, object]:
         """The declaration for JSON; ``Model(**d)`` makes the same model again."""
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+        kept = self._described_fields()
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items() if key in kept}

@@ -49,6 +49,7 @@ class Plant:
         noise: how unit process noise moves the state, ``f(z, c)`` -> (n,).
         substeps: Runge-Kutta steps per sample; 0 for a difference equation.
         held: whether the noise is constant over a sample.
+        independent: whether each state has noise of its own, which ``noise`` scales.
     """
 
     move: Callable
@@ -56,10 +57,16 @@ class Plant:
     noise: Callable
     substeps: int = 0
     held: bool = False
+    independent: bool = False
+
+    def effects(self, z, c) -> np.ndarray:
+        """How each source of unit process noise moves the state, (n, sources)."""
+        g = np.array(self.noise(z, c), dtype=float)
+        return np.diag(g) if self.independent else g[:, None]
 
     @classmethod
-    def of(cls, model) -> Plant:
-        """The plant of a declaration's strings, whose process noise is white."""
+    def of(cls, model, ratios=None) -> Plant:
+        """The plant of a declaration's strings; ``ratios``: factor on each state's noise."""
 
         def evaluated(texts, z, c, **inputs):
             names = dict(zip(model.names, [*z, *c], strict=True)) | inputs | {"pi": np.pi, **model.constants}
@@ -72,8 +79,10 @@ class Plant:
         return cls(
             move,
             lambda z, c, u: evaluated(model.outputs.values(), z, c, u=u),
-            lambda z, c: evaluated(model.noise, z, c),
+            lambda z, c: np.multiply(evaluated(model.noise, z, c), 1.0 if ratios is None else ratios),
             substeps=model.substeps if model.is_continuous else 0,
+            held=model.held,
+            independent=model.independent_noise,
         )
 
 
@@ -143,20 +152,20 @@ def spread(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) 
     """N (n, n), covariance of the state by unit process noise over a sample."""
     n = len(z)
     if not plant.substeps:
-        g = np.array(plant.noise(z, c), dtype=float)
-        return np.outer(g, g)
+        G = plant.effects(z, c)
+        return G @ G.T
 
     def rates(x: np.ndarray, t: float) -> np.ndarray:
         z, u = x[:n], polynomial(inputs, t)
         f = lambda z: plant.move(z, c, u)  # noqa: E731
-        slope, g = jacobian(f, z), np.array(plant.noise(z, c), dtype=float)
-        if plant.held:
-            return np.concatenate([rows(f(z), z), slope @ x[n:] + g])
-        N = x[n:].reshape(n, n)
-        return np.concatenate([rows(f(z), z), (slope @ N + N @ slope.T + np.outer(g, g)).ravel()])
+        slope, G = jacobian(f, z), plant.effects(z, c)
+        N = x[n:].reshape(n, -1)
+        rate = slope @ N + G if plant.held else slope @ N + N @ slope.T + G @ G.T
+        return np.concatenate([rows(f(z), z), rate.ravel()])
 
-    end = runge_kutta(rates, np.concatenate([z, np.zeros(n if plant.held else n * n)]), plant.substeps)[n:]
-    return np.outer(end, end) if plant.held else sound(end.reshape(n, n))
+    size = plant.effects(z, c).size if plant.held else n * n
+    end = runge_kutta(rates, np.concatenate([z, np.zeros(size)]), plant.substeps)[n:].reshape(n, -1)
+    return end @ end.T if plant.held else sound(end)
 
 
 def sound(N: np.ndarray) -> np.ndarray:
@@ -293,7 +302,7 @@ class Walk:
     growth: float
 
 
-def path(plant: Plant, z, V, c, inputs, Q: float, R: Sequence[float], y=None) -> Walk:
+def path(plant: Plant, z, V, c, inputs, Q: float, R: Sequence[float], y=None, slopes=None) -> Walk:
     """The Kalman filter of the model linearised along its own trajectory, with sensitivities at held gains.
 
     Args:
@@ -303,9 +312,11 @@ def path(plant: Plant, z, V, c, inputs, Q: float, R: Sequence[float], y=None) ->
         inputs: by sample: taps, or coefficients of the polynomial.
         Q, R: variances of the noises.
         y: outputs by sample and sensor; None where the trajectory is followed without them.
+        slopes: (n, K) of the state before the first sample by the coefficients; 0 where it is None.
     """
     n, K, T = len(z), len(c), len(inputs)
     Z, F, slope = np.zeros((n, K)), np.zeros((K, K)), np.zeros(K)
+    Z = Z if slopes is None else np.array(slopes)
     shown, innovations, variances = np.zeros((3, T, len(R)))
     transitions, growth = np.eye(n)[None], 1.0
     for t, taps in enumerate(inputs):

@@ -21,6 +21,30 @@ from estimator.models.wiener_hammerstein import WIENER_HAMMERSTEIN
 DRAG = replace(SIGNED_DRAG, outputs={"y": "abs(x)"})
 
 
+#: Noise in both rates, and its strength depends on the state.
+INDEPENDENT = Model(
+    "independent",
+    {"x": "m", "v": "m/s"},
+    {"k": "1", "cubic": "1", "gain": "1"},
+    noise=("0.5", "2 + 0.1*x"),
+    outputs={"y": "x"},
+    rates=("v", "gain*u - k*x - cubic*x**3 - 0.1*v"),
+    substeps=4,
+    independent_noise=True,
+)
+
+#: Noise in both next states.
+ADDED = Model(
+    "added",
+    {"x": "m", "w": "m"},
+    {"a": "1", "b": "1"},
+    noise=("1", "0.3"),
+    outputs={"y": "x", "z": "w"},
+    next_state=("a*x + b*w + u", "x - 0.1*w**3"),
+    independent_noise=True,
+)
+
+
 @dataclass(frozen=True)
 class Case:
     """A model, its equations written again, and where its quantities are.
@@ -86,6 +110,10 @@ def _cubic(z, c, u):
     return [_three_tap(z, c, u)[0] + more, x]
 
 
+def _independent(z, c, u):
+    return [z[1], c[2] * u - c[0] * z[0] - c[1] * z[0] ** 3 - 0.1 * z[1]]
+
+
 _ADDED = {"show": _first, "noise": lambda z, c: [1.0, 0.0]}
 _WHITE = Plant(_duffing, _first, _white, substeps=8)
 _COEFFICIENTS = (0.45, 1.2, 0.08, 0.5)
@@ -137,6 +165,24 @@ CASES = {
             lambda z, c, u: [_magnitude(z[0])], _white, substeps=4,
         ),
         (-0.8, 0.9, 0.5, 0.6, 0.4), degree=1,
+    ),
+    "independent noises": Case(
+        INDEPENDENT,
+        Plant(_independent, _first, lambda z, c: [0.5, 2.0 + 0.1 * z[0]], substeps=4, independent=True),
+        (0.3, -0.2, 0.6, 0.3, 0.4), degree=1,
+    ),
+    "independent noises, held": Case(
+        replace(INDEPENDENT, held=True, substeps=2),
+        Plant(_independent, _first, lambda z, c: [0.5, 2.0 + 0.1 * z[0]], substeps=2, held=True, independent=True),
+        (0.3, -0.2, 0.6, 0.3, 0.4),
+    ),
+    "independent noises, added": Case(
+        ADDED,
+        Plant(
+            lambda z, c, u: [c[0] * z[0] + c[1] * z[1] + u[0], z[0] - 0.1 * z[1] ** 3], lambda z, c, u: [z[0], z[1]],
+            lambda z, c: [1.0, 0.3], independent=True,
+        ),
+        (0.2, 0.1, 0.7, -0.4),
     ),
 }  # fmt: skip
 
