@@ -22,6 +22,7 @@ from duffing_env.storage.kernel_spec import (
     block_layout,
     block_offsets,
     compile_unpacker,
+    noise_draw_rows,
     observation_bounds,
     parameter_names,
 )
@@ -100,7 +101,8 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
     is_simulated, has_noise_hypotheses = spec.plant_model is not None, spec.has_noise_hypotheses
     is_structured = spec.factorisation == "structured"
 
-    draw_noise, hooks = plant_stages.compile_noise_draw(row_of), compile_reward_hooks(spec, generated)
+    draw_noise = plant_stages.compile_noise_draw(row_of, noise_draw_rows(spec.truth_model))
+    hooks = compile_reward_hooks(spec, generated)
     _, before_plant_step, before_update, after_update = hooks
     apply_input, replay_sample = input_limits.compile_input(spec, generated), sample_stages.compile_replay(spec)
     simulate_sample: Any = sample_stages.compile_simulation(spec, generated, draw_noise) if is_simulated else None

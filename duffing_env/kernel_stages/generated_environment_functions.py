@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import combinations
 from typing import Any
@@ -17,6 +17,7 @@ from duffing_env.storage.kernel_spec import (
     estimated_expressions,
     last_input_entries,
     model_input_rows,
+    noise_draw_rows,
     noise_std_rows,
     observation_bounds,
     parameter_names,
@@ -95,19 +96,11 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
     lines, results = symbolic.propagate_state(model, degree, names)
     derivatives, symbol = symbolic.differentiate(model), symbolic.symbol
     noises = list(noise_std_rows(model))
-    strength, w, v = symbol(noises[0]), symbol("NOISE_w"), symbol("NOISE_v")
+    draws = [tuple(map(symbol, rows)) for rows in noise_draw_rows(model)]
+    w, v = draws[0]
     after: dict[str, Any] = {}
     for a, x in enumerate(model.states):
-        kick = strength * derivatives.noise[a] * w
-        if model.is_continuous:
-            # A state takes the increment of the noise over a step of length h; a state that the noise reaches only
-            # through other states takes the integral. For white noise both are drawn jointly.
-            h = symbol("length")
-            through = sum(derivatives.jacobian[a][k] * strength * derivatives.noise[k] for k in range(model.n_states))
-            direct, integral = h * w, h * h / 2 * w
-            if not model.held:
-                direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
-            kick = strength * derivatives.noise[a] * direct if derivatives.noise[a] != 0 else through * integral
+        kick = _noise_of_state(model, a, symbol(noises[0]), draws)
         kick = symbolic.substitute([("", kick)], names)[0][1]
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
         after[x] = symbol(f"K_{x}")
@@ -125,6 +118,31 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
             results |= {f"Y_{y}": "SHOWN"}
     substep_arguments = ("TAU", "length", "root", "root_3") if model.is_continuous else ()
     return source + loop("step_plant", "The plant moves.", lines, results, *substep_arguments)
+
+
+def _noise_of_state(model: Model, a: int, strength: Any, draws: Sequence[tuple[Any, Any]]) -> Any:
+    """What the process noise adds to state ``a`` over a step, from two standard normal numbers of each source.
+
+    A state takes the increment of the noise over a step of length h; a state that the noise reaches only through other
+    states takes the integral. For white noise both are drawn jointly. With independent noises a state takes both.
+    """
+    from estimator.engine import symbolic
+
+    derivatives, symbol, total = symbolic.differentiate(model), symbolic.symbol, symbolic.ZERO
+    for effect, (w, v) in zip(symbolic.noise_effects(model), draws, strict=False):
+        if not model.is_continuous:
+            total += strength * effect[a] * w
+            continue
+        h = symbol("length")
+        through = sum(derivatives.jacobian[a][k] * strength * effect[k] for k in range(model.n_states))
+        direct, integral = h * w, h * h / 2 * w
+        if not model.held:
+            direct, integral = symbol("root") * w, h * symbol("root") / 2 * (w + v / symbol("root_3"))
+        if effect[a] == 0:
+            total += through * integral
+        else:
+            total += strength * effect[a] * direct + (through * integral if model.independent_noise else 0)
+    return total
 
 
 def _true_coefficients_source(spec: KernelSpec, loop: Any) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from duffing_env.storage.random_streams import box_muller, float_to_word, sfc64_next, to_open_uniform, word_to_float
-from estimator.compilation.simd import LANES, jit, lanewise
+from estimator.compilation.simd import LANES, jit, jit_closure, lanewise
 from estimator.rigs.rig_prior import STDS_PER_90_PERCENT
 
 #: Distance of a float32 action from the float64 value that it stands for, at most, in parts of the input's scale.
@@ -30,9 +30,21 @@ def draw_two_normals(SFC64_a, SFC64_b, SFC64_c, SFC64_d, NEEDS_RESET):
     )  # fmt: skip
 
 
-def compile_noise_draw(row_of: Mapping[str, int]) -> Any:
-    """``draw_two_normals(W)``: two standard normal numbers in every lane, into rows ``NOISE_w`` and ``NOISE_v``."""
-    return lanewise(row_of, "SFC64_a SFC64_b SFC64_c SFC64_d NOISE_w NOISE_v")(draw_two_normals)
+def compile_noise_draw(row_of: Mapping[str, int], pairs: Sequence[tuple[str, str]] = (("NOISE_w", "NOISE_v"),)) -> Any:
+    """``draw_noise(W)``: two standard normal numbers in every lane for each source of noise.
+
+    Args:
+        row_of: name of a quantity to its row.
+        pairs: rows of each source's numbers (`duffing_env.storage.kernel_spec.noise_draw_rows`).
+    """
+    draws = [lanewise(row_of, f"SFC64_a SFC64_b SFC64_c SFC64_d {w} {v}")(draw_two_normals) for w, v in pairs]
+    if len(draws) == 1:
+        return draws[0]
+    names = {f"draw_{k}": draw for k, draw in enumerate(draws)}
+    source = "def draw_noise(W):\n" + "".join(f"    {name}(W)\n" for name in names)
+    namespace: dict[str, Any] = dict(names)
+    exec(source, namespace)
+    return jit_closure("_".join(str(row_of[row]) for pair in pairs for row in pair))(namespace["draw_noise"])
 
 
 def limit_input(REQUESTED_INPUT, INPUT, LAST_INPUT, ENERGY_SPENT, budget, max_slew):

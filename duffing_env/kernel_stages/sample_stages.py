@@ -47,7 +47,7 @@ def compile_truth_update(spec: KernelSpec, generated: Any, hooks: RewardHooks) -
 def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -> Any:
     """``reset_lane(W, members, b, j, params)``: start an episode in lane j of block b.
 
-    Its plant is drawn and put at rest, and its belief put to the prior.
+    Its plant is drawn and put at rest, or in the first states of `Model.initial_states`; its belief is the prior.
     """
     offset_of, n_record = block_offsets(spec), len(belief_rows(spec.belief_model))
     first_stream, first_parameter = offset_of["SFC64_a"], offset_of[f"PARAM_{parameter_names(spec.truth_model)[0]}"]
@@ -59,6 +59,11 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
     zeroed_names += missing_mean_field_rows(spec)
     zeroed_names += [f"Y_{y}" for y in spec.truth_model.outputs] + [f"X_{x}" for x in spec.truth_model.states]
     zeroed_rows = tuple(offset_of[name] for name in zeroed_names)
+    states, coefficients = list(spec.truth_model.states), list(spec.truth_model.coefficients)
+    first_states = tuple(
+        (offset_of[f"X_{states[i]}"], offset_of[f"TRUE_{coefficients[k]}"])
+        for i, k in spec.truth_model.initial_state_coefficients
+    )
     jump_rows = "SFC64_a SFC64_b SFC64_c SFC64_d JUMP_AT JUMP_FACTOR"
     draw_parameter_jump = lanewise(block_layout(spec), jump_rows, uniform="jump horizon", single_lane=True)(
         plant_stages.draw_parameter_jump
@@ -79,7 +84,16 @@ def compile_reset(spec: KernelSpec, update_truth: Any, reset_filter_bank: Any) -
             W[r + j] = 0.0
         update_truth(W, j, params)
 
-    return reset_lane
+    if not first_states:
+        return reset_lane
+
+    @jit_closure(spec.name)
+    def reset_lane_in_motion(W, members, b, j, params):
+        reset_lane(W, members, b, j, params)
+        for state, coefficient in first_states:
+            W[state + j] = W[coefficient + j]
+
+    return reset_lane_in_motion
 
 
 def compile_replay(spec: KernelSpec) -> Any:

@@ -236,6 +236,12 @@ def noise_std_rows(model: Model) -> dict[str, str]:
     return {"process_noise": "PROCESS_STD", **sensors}
 
 
+def noise_draw_rows(model: Model) -> list[tuple[str, str]]:
+    """Rows of the two standard normal numbers of each source of process noise; the sensors take the first pair."""
+    further = [(f"NOISE_w_{source}", f"NOISE_v_{source}") for source in model.noise_sources[1:]]
+    return [("NOISE_w", "NOISE_v"), *further]
+
+
 def estimated_expressions(model: Model) -> Mapping[str, str]:
     """Name of each parameter that is compared with the truth, to its expression in the coefficients."""
     return model.physical or {c: c for c in model.coefficients}
@@ -254,7 +260,7 @@ def block_layout(spec: KernelSpec) -> Mapping[str, int]:
     row_names += [f"X_{x}" for x in truth.states]
     row_names += [f"TRUE_{c}" for model in {truth: None, belief: None} for c in model.coefficients]
     row_names += [f"INVERSE_TRUE_{p}" for p in estimated_expressions(belief)]
-    row_names += ["SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d", "NOISE_w", "NOISE_v"]
+    row_names += ["SFC64_a", "SFC64_b", "SFC64_c", "SFC64_d", *(row for pair in noise_draw_rows(truth) for row in pair)]
     row_names += [row for i in truth.inputs for row in _environment_input_rows(i)]
     row_names += ["ENERGY_SPENT", "JUMP_AT", "JUMP_FACTOR"]
     row_names += ["ELAPSED_SAMPLES", "NEEDS_RESET", "LOG_DET", "LOG_DENSITY", "PARAMETER_ERROR"]

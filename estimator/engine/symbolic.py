@@ -347,5 +347,3 @@ def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tup
         lines.append((f"NEXT_{x}", value))
         results[row_of[x]] = f"NEXT_{x}"
     return substitute(lines, row_of), results
-
-
