@@ -23,27 +23,8 @@ def check_has_inputs(model: Model) -> None:
     if not model.inputs:
         raise ValueError(
             f"model must have an input for an environment, whose action it is, but {model.name!r} has none; name one "
-            "in its inputs, or estimate it with OnlineEstimator"
+            "in its inputs"
         )
-
-
-def check_single_input(user: str, model: Model, remedy: str) -> str:
-    """The name of the only input of a model.
-
-    Args:
-        user: what is made for one input alone, for the message.
-        model: of the belief.
-        remedy: what to do instead.
-
-    Raises:
-        ValueError: for a model with several inputs or none.
-    """
-    if model.n_inputs != 1:
-        raise ValueError(
-            f"model must have one input for {user}, but {model.name!r} has {model.n_inputs}, {list(model.inputs)}; "
-            f"{remedy}"
-        )
-    return next(iter(model.inputs))
 
 
 def checked_by_input(

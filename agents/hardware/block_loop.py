@@ -22,7 +22,7 @@ from agents.planning.open_loop.posterior_samples import MonteCarloSystems
 from agents.policies import Policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
-from duffing_env.input_options import check_single_input
+from estimator.models.single_input import check_single_input
 from estimator.support.array_types import FloatArray
 
 

@@ -25,10 +25,10 @@ from agents.policies import make_policy
 from agents.policies.efe_planner import EfePlanner
 from agents.policies.signals import SignalPolicy
 from agents.user_code import attribute_user_errors
-from duffing_env.input_options import check_single_input
 from estimator.belief import Belief, covariance_indices
 from estimator.identification.diagnostics.record_checks import MIN_SAMPLES_PER_PERIOD, RECOMMENDED_SAMPLES_PER_PERIOD
 from estimator.inference.free_run import free_run
+from estimator.models.single_input import check_single_input
 from estimator.rigs.physical_parameters import propagate_to_physical
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import rig_prior

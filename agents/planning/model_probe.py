@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from duffing_env.input_options import check_single_input
 from duffing_env.storage.kernel_spec import last_input_entries, observation_bounds
 from estimator.belief import Belief
 from estimator.compilation.array_operations import copy
@@ -19,6 +18,7 @@ from estimator.compilation.simd import kernel
 from estimator.engine.noise_free_step import compile_noise_free_step
 from estimator.engine.storage_layout import input_history_row
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.support.array_types import FloatArray
 
 

@@ -53,8 +53,8 @@ from agents.planning.plan_objective import DEFAULT_RISK, PlanObjective, margin_p
 from agents.planning.receding_horizon import PlanArrays, PlanSettings, compile_receding_horizon
 from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales, recoverable_step
 from agents.predict_argument_checks import check_batch_size, check_last_observation, episode_starts
-from duffing_env.input_options import check_single_input
 from estimator.engine.noise_free_step import with_coarse_substeps
+from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import MIN_MAGNITUDE, check_integer, check_number, short_repr, to_float_array
 from estimator.support.array_types import FloatArray
 

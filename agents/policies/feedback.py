@@ -24,7 +24,7 @@ from agents.policies.excitations import BAND
 from agents.policies.signals import InputLimits, input_limits_of
 from agents.predict_argument_checks import check_batch_size, check_state, episode_starts
 from duffing_env.experiment_config import Experiment, SimulatedExperiment
-from duffing_env.input_options import check_single_input
+from estimator.models.single_input import check_single_input
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import to_float_array
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from estimator.engine.input_hold import input_degree
 from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.rigs.physical_parameters import physical_jacobian, to_physical
 from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import MAX_MAGNITUDE, check_number, to_float_array
@@ -61,6 +62,7 @@ def fisher_information(
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
     degree = input_degree(Model.require_model(model), interpolation)
+    check_single_input("Fisher information", model, "use record_likelihoods with the inputs of each sample")
     noises = noise_variances(model, process_noise, measurement_noise, process_ratios)
     check_number("state_std", state_std, 0, MAX_MAGNITUDE, "0 is at rest")
     points, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)

@@ -15,6 +15,7 @@ from estimator.engine.kernels import RUNTIME_FUNCTIONS
 from estimator.engine.source_cache import load_generated
 from estimator.engine.storage_layout import input_rows
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
@@ -43,6 +44,7 @@ def free_run(
     Raises:
         ValueError: for shapes that do not fit, or anything but numbers.
     """
+    check_single_input("a free run", model, "step an environment of it")
     values, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
     start = np.zeros(model.n_states) if state is None else to_float_array("state", state)
     systems = {len(given) for given in (values, inputs, start) if given.ndim == 2}

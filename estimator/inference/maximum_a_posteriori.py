@@ -22,6 +22,7 @@ from estimator.belief import Belief
 from estimator.engine.input_hold import input_degree
 from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
@@ -93,6 +94,7 @@ def maximum_a_posteriori(
     Raises:
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
+    check_single_input("a fit", model, "estimate in an environment of it")
     inputs = to_float_array("u", u)
     if inputs.ndim != 2:
         raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")

@@ -85,20 +85,18 @@ def record_likelihoods(
         forecasts: (n, T, p, 2) receives the predictive mean and variance of each output.
         initial_state_slopes: (n, n_states, K) derivatives of ``initial_state`` by the coefficients; None for all 0.
     """
-    k = model.n_coefficients
+    k, upper = model.n_coefficients, _upper_triangle(model.n_coefficients)
     lengths = record_lengths(inputs[:, :, 0])
     totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
     initial_moments = _initial_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
-    outputs = np.zeros((0, 0, 0)) if y is None else y
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
-    degree = inputs.shape[2] - 1 if model.is_continuous else 0
-    variable_step = sample_lengths is not None
-    lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
+    degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous else 0
+    outputs = np.zeros((0, 0, 0)) if y is None else y
     forecast_array = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
-    run = compile_record_filter(model, degree, y is not None, variable_step)
+    lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
+    run = compile_record_filter(model, degree, y is not None, sample_lengths is not None)
     run(coefficients, inputs, outputs, lengths_in_steps, lengths, initial_moments, noise_rows, totals, forecast_array)
     information = np.empty((len(inputs), k, k))
-    upper = _upper_triangle(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
     return RecordLikelihoods(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
 

@@ -11,26 +11,13 @@ import json
 import keyword
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 
-from estimator.models.expression import (
-    FUNCTIONS,
-    input_derivative,
-    names_in,
-    names_in_expression,
-    older_input,
-    parse,
-)
+from estimator.models.expression import FUNCTIONS, input_derivative, names_in, names_in_expression, older_input, parse
 from estimator.models.finite_slopes import check_slopes
-from estimator.support.argument_checks import (
-    check_bool,
-    check_choice,
-    check_integer,
-    check_mapping,
-    check_number,
-    short_repr,
-)
+from estimator.support import argument_checks
+from estimator.support.argument_checks import check_bool, check_integer, check_mapping, check_number, short_repr
 
 #: Names of inputs, states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
@@ -90,7 +77,8 @@ class Model:
             noise is the root of a white intensity per second. `estimator.rigs.stated_units` makes a prior and a scaled
             model of it.
         independent_noise: whether each state has process noise of its own, independent of the others'. The expressions
-            in ``noise`` are then the ratios of the strengths, which one unknown factor scales (`with_noise_ratios`).
+            in ``noise`` are then the ratios of the strengths, which one unknown factor scales
+            (`estimator.models.noise_ratios.scale_noise_sources` changes them).
         initial_states: state to the coefficient that is its unknown value before the first sample; the others begin
             near rest. Such a coefficient may occur in no expression.
 
@@ -129,7 +117,7 @@ class Model:
         for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse", "initial_states"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
-        check_choice("time", self.time, ("sample", "s"))
+        argument_checks.check_choice("time", self.time, ("sample", "s"))
         if self.time == "s" and self.next_state:
             raise ValueError("time must be 'sample' for a difference equation, but is 's'; leave it out")
         check_mapping("constants", self.constants)
@@ -317,28 +305,6 @@ class Model:
         """Places (state, coefficient) of ``initial_states``."""
         states, coefficients = list(self.states), list(self.coefficients)
         return tuple((states.index(state), coefficients.index(c)) for state, c in self.initial_states.items())
-
-    def with_noise_ratios(self, ratios: Mapping[str, float]) -> Model:
-        """This model with the process noise of some states scaled.
-
-        Args:
-            ratios: state to the positive factor on its standard deviation; the others keep theirs.
-
-        Raises:
-            ValueError: for a model whose states share one source, a state without noise, or a factor out of range.
-        """
-        check_mapping("ratios", ratios)
-        unknown = sorted(set(ratios).difference(self.noise_sources))
-        if unknown:
-            raise ValueError(
-                f"ratios must be of states with independent noise, {list(self.noise_sources)}, but have {unknown}; "
-                "declare the model with independent_noise=True"
-            )
-        for state, ratio in ratios.items():
-            check_number(f"ratios of {state}", ratio, 1e-30, 1e30)
-        pairs = zip(self.states, self.noise, strict=True)
-        noise = tuple(f"{float(ratios[state])!r}*({text})" if state in ratios else text for state, text in pairs)
-        return replace(self, noise=noise)
 
     def _described_fields(self) -> dict[str, object]:
         """The fields by name, without cached properties, and without later additions at their defaults.

@@ -13,6 +13,7 @@ from estimator.inference.fisher_information import fisher_information
 from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.model import Model
+from estimator.models.noise_ratios import scale_noise_sources
 from estimator.priors import weak_prior
 
 #: Two coupled states, each with noise of its own.
@@ -83,7 +84,7 @@ def test_ratios_declared_and_given_are_the_same(name):
     u = np.random.default_rng(4).uniform(-1, 1, 25)
     first, second = model.states
     ratios = {first: 2.0, second: 0.3}
-    declared = fisher_information(model.with_noise_ratios(ratios), c, u, 0.02, 0.01)
+    declared = fisher_information(scale_noise_sources(model, ratios), c, u, 0.02, 0.01)
     np.testing.assert_allclose(fisher_information(model, c, u, 0.02, 0.01, process_ratios=ratios), declared, rtol=1e-12)
     assert np.abs(fisher_information(model, c, u, 0.02, 0.01) / declared - 1).max() > 0.05
 
@@ -98,7 +99,7 @@ def test_estimates_of_ratios_given_and_declared_agree():
     prior = weak_prior(CHAIN, [0.5, 1.0], 0.1 * np.eye(2))
     ratios = {"x": 0.01, "w": 30.0}
     given = maximum_a_posteriori(CHAIN, u, y, prior, 0.01, 0.05, process_ratios=ratios)
-    declared = CHAIN.with_noise_ratios(ratios)
+    declared = scale_noise_sources(CHAIN, ratios)
     fitted = maximum_a_posteriori(declared, u, y, replace(prior, model=declared), 0.01, 0.05)
     np.testing.assert_allclose(given.mean, fitted.mean, rtol=1e-6)
     assert given.converged.all()
@@ -106,7 +107,7 @@ def test_estimates_of_ratios_given_and_declared_agree():
 
 def test_the_online_update_of_a_linear_model_is_a_kalman_filter():
     """With coefficients and noises known, against the matrices of the declared noise."""
-    model, q, r = CHAIN.with_noise_ratios({"w": 4.0}), 0.05, 0.1
+    model, q, r = scale_noise_sources(CHAIN, {"w": 4.0}), 0.05, 0.1
     prior = weak_prior(model, [0.6, 0.8], np.zeros((2, 2)), q, r, noise_shape=1e12, state_std=0.3)
     rng = np.random.default_rng(6)
     u, y = rng.uniform(-1, 1, 20), rng.standard_normal(20)
@@ -135,9 +136,9 @@ def test_digests_and_files_of_other_models_do_not_change():
     ("call", "words"),
     [
         (lambda: replace(CHAIN, independent_noise=1), "independent_noise must be"),
-        (lambda: CHAIN.with_noise_ratios({"y": 1.0}), "ratios must be of states with independent noise, ['x', 'w']"),
-        (lambda: CHAIN.with_noise_ratios({"w": 0.0}), "ratios of w must be"),
-        (lambda: duffing().with_noise_ratios({"x": 2.0}), "independent_noise=True"),
+        (lambda: scale_noise_sources(CHAIN, {"y": 1.0}), "ratios must be of states with independent noise, ['x', 'w']"),
+        (lambda: scale_noise_sources(CHAIN, {"w": 0.0}), "ratios of w must be"),
+        (lambda: scale_noise_sources(duffing(), {"x": 2.0}), "independent_noise=True"),
         (lambda: noise_variances(CHAIN, 1.0, 1.0, {"z": 1.0}), "process_ratios must be of states"),
         (lambda: noise_variances(CHAIN, 1.0, 1.0, {"w": -1.0}), "process_ratios['w'] must be 0 or more"),
         (lambda: noise_variances(CHAIN, np.ones(3), 1.0, {"w": np.ones(2)}), "must be batches of one size"),

@@ -12,9 +12,9 @@ from agents.planning.model_probe import ModelView, observation_layout, planning_
 from agents.planning.time_scales import kept_accumulated_noise, probe_time_scales
 from agents.policies.networks.feature_names import FEATURE_NAMES
 from agents.policies.networks.rollout_features import compile_features
-from duffing_env.input_options import check_single_input
 from estimator.compilation.simd import kernel
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import short_repr
 from estimator.support.array_types import FloatArray
 

@@ -20,8 +20,8 @@ from agents.policies.networks.compiled_decision import CompiledActor, compile_de
 from agents.policies.networks.feature_encoder import FeatureEncoder
 from agents.policies.networks.lstm import FloatArray, Lstm, checked_tensor
 from agents.predict_argument_checks import check_observation_finite, check_observation_size
-from duffing_env.input_options import check_single_input
 from estimator.models.model import Model
+from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import check_integer, check_number, to_float_array
 from estimator.support.file_io import check_readable_file
 

@@ -14,7 +14,7 @@ from agents.training.environments import oscillator_family
 from agents.training.environments.feature_vec_env import FeatureVecEnv
 from agents.training.environments.randomised_vec_env import DrawOptions, MixedVecEnv, TrackOptions, draw_track_options
 from agents.training.training_config import INFORMATION_REWARDS, TrainConfig
-from duffing_env.input_options import check_single_input
+from estimator.models.single_input import check_single_input
 
 #: Environments in which random actions are played to fit the normaliser of the features.
 N_NORMALISER_ENVS = 64
