@@ -274,7 +274,8 @@ def input_limits_of(env: Any) -> tuple[InputLimits, int]:
             f"{type(env).__name__}; pass what gym.make, gym.make_vec or DuffingVecEnv made of its id"
         )
     experiment = getattr(env, "experiment", None)
-    max_inputs = (env.max_input,) if experiment is None else tuple(experiment.max_inputs.tolist())
+    by_input = getattr(experiment, "max_inputs", None)
+    max_inputs = (env.max_input,) if by_input is None else tuple(by_input.tolist())
     max_input = max_inputs if len(max_inputs) > 1 else max_inputs[0]
     limits = InputLimits(max_input, getattr(experiment, "max_rms", None), getattr(experiment, "hold", 1))
     return limits, min(getattr(env, "horizon", None) or DEFAULT_SAMPLES, _MAX_DRAW_SAMPLES)

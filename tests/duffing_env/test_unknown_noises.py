@@ -65,7 +65,7 @@ def test_drawn_noises_are_the_plants_noises_and_change_nothing_else():
         np.testing.assert_array_equal(loud.truth()[name], plain.truth()[name])
     assert list(plain.truth()) == list(PARAMETERS)
     np.testing.assert_array_equal(plain.row_values("PROCESS_STD"), 5e-4)
-    loud.step(np.zeros(100))  # from rest: the noise is all that moves it
+    loud.step(np.zeros((100, 1)))  # from rest: the noise is all that moves it
     x, truth = loud.row_values("X_x1"), loud.truth()
     np.testing.assert_allclose(x, truth.process_noise * loud.row_values("NOISE_w"), rtol=1e-14)
     shown = truth.measurement_noise * loud.row_values("NOISE_v")
