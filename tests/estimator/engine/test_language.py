@@ -12,8 +12,9 @@ from estimator.compilation.simd import LANES
 from estimator.engine import printer_numba
 from estimator.engine.expression_parser import parse_expression
 from estimator.engine.kernels import RUNTIME_FUNCTIONS
+from estimator.engine.reverse_mode import reverse_mode_derivative
 from estimator.engine.source_cache import load_generated
-from estimator.engine.symbolic import eliminate_common_subexpressions, reverse_mode_derivative, substitute, symbol
+from estimator.engine.symbolic import eliminate_common_subexpressions, substitute, symbol
 from estimator.inference.free_run import free_run
 from estimator.models.difference_equation import difference
 from estimator.models.expression import evaluate, parse
