@@ -196,7 +196,7 @@ def test_the_cost_is_price_goal_and_what_is_within_the_margin_or_beyond_the_limi
     place = compile_expected_update(model, degree).layout
     shown, variance = W[place["Y_PRED"], 0], W[place["S_PRED"], 0]
     assert W[place["PENDING_VARIANCE"], 0] == 0.0  # the output before the first sample has been seen
-    # The margin contains five standard deviations of a sample's process noise, and is at most half of the limit.
+    # The margin contains five times the process noise of a sample, and is at most half of the limit.
     deviation = np.sqrt(variance + 5.0 * 0.01**2)
     within = abs(shown) + min(2.0 * deviation, 0.5 * limit) - limit
     assert within > 0

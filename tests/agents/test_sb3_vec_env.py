@@ -344,7 +344,7 @@ def test_episodes_go_on_in_other_environments_from_a_copy_of_the_memory(track, o
     np.testing.assert_array_equal(other.restore_episode_state(copied), seen)
     for _ in range(70):
         actions = rng.uniform(-1, 1, (11, 1)).astype(np.float32)
-        (seen, rewards, dones, infos), (*others, other_told) = one.step(actions), other.step(actions)
+        (seen, rewards, dones, infos), (*others, other_infos) = one.step(actions), other.step(actions)
         for mine, its in zip((seen, rewards, dones), others, strict=True):
             np.testing.assert_array_equal(mine, its)
-        assert [t.get("episode", {}).get("r") for t in infos] == [t.get("episode", {}).get("r") for t in other_told]
+        assert [t.get("episode", {}).get("r") for t in infos] == [t.get("episode", {}).get("r") for t in other_infos]

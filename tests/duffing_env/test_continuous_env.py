@@ -20,7 +20,7 @@ def test_the_fisher_information_is_refused_to_an_equation_that_the_plant_does_no
 
 
 #: Only `make evidence` runs these, because a kernel takes seconds to compile: the rewards by free energy, free run and
-#: #: Fisher information are tested on the difference equation.
+#: Fisher information are tested on the difference equation.
 EVIDENCE = ("free_energy", "simulation_error", "fisher")
 MEAN_FIELD = {"estimator": "nlarx", "factorisation": "mean_field"}
 FOLLOWED = [

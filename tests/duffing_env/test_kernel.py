@@ -24,7 +24,7 @@ CENTER = np.array([getattr(SILVERBOX_TWIN, name) for name in PARAMETERS])
 
 
 #: Only `make evidence` runs these kernels: rewards use a mean-field belief as they use any other. The free energy of a
-#: #: structured belief is compared over the record, in test_replay.py.
+#: structured belief is compared over the record, in test_replay.py.
 PAIRS = [("structured", reward) for reward in REWARDS if reward != "free_energy"]
 PAIRS += [
     ("mean_field", "free_energy"),

@@ -17,6 +17,6 @@ def test_the_twin_is_identified_from_the_record(record):
 
 def test_the_continuous_twin_is_identified_from_the_record(record):
     found = identify_continuous_twin(record)
-    # The tracks fix the constants. The present estimator weights the two noises differently, which on this record (no #
+    # The tracks fix the constants. The present estimator weights the two noises differently, which on this record (no
     # exact oscillator of Eq. (1)) changes the cubic term by 4e-4 of its value.
     assert dict(found) == pytest.approx(dict(SILVERBOX_ODE_TWIN), rel=5e-4)

@@ -102,7 +102,7 @@ def update(
     N[:n, :n] = spread(plant, belief.mean[:n], belief.mean[n:], inputs)
     u = input_seen(plant, inputs)
     shows = lambda x: plant.show(x[:n], x[n:], u)  # noqa: E731
-    return _told(belief, mean, cov, size, N, shows, y, iterations)
+    return _condition_on_outputs(belief, mean, cov, size, N, shows, y, iterations)
 
 
 def structured_update(prior: Any, step: Step, y: float, iterations: int) -> tuple[Any, float]:
@@ -123,13 +123,13 @@ def structured_update(prior: Any, step: Step, y: float, iterations: int) -> tupl
     N = np.zeros_like(cov)
     N[:n, :n] = step.noise
     belief = Belief(prior.mean, prior.cov, prior.gamma, [prior.xi])
-    outcome = _told(belief, mean, cov, np.abs(cov), N, lambda x: [x[0]], [y], iterations)
+    outcome = _condition_on_outputs(belief, mean, cov, np.abs(cov), N, lambda x: [x[0]], [y], iterations)
     after = outcome.belief
     posterior = replace(prior, mean=after.mean, cov=(after.cov + after.cov.T) / 2, gamma=after.gamma, xi=after.xi[0])
     return posterior, outcome.free_energies[0][-1]
 
 
-def _told(
+def _condition_on_outputs(
     belief: Belief,
     mean: np.ndarray,
     cov: np.ndarray,
