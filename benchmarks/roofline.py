@@ -139,7 +139,7 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
         "noise": {compile_noise_draw(block_layout(kind)): 1},
         "plant": {code.step_plant: 1},
         _INFERENCE[factorisation]: inference,
-        "reward and end": {code.finish_step: 1},
+        "reward and end": {code.finish_step_lanes: 1},
         "observation": {code.observe_lanes: 1},
     }
 
