@@ -16,7 +16,7 @@ COPIES = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
 
 
 def random_actions(steps, rows=1, seed=0, inputs=1):
-    """Actions (steps, rows, inputs), some beyond the limits; those of a row do not depend on the number of rows."""
+    """Actions (steps, rows, inputs), some beyond the limits; a row's actions do not depend on the number of rows."""
     columns = [np.random.default_rng([seed, row]).uniform(-1.2, 1.2, (steps, inputs)) for row in range(rows)]
     return np.stack(columns, axis=1).astype(np.float32)
 

@@ -33,7 +33,7 @@ def estimate_with_other_estimators(
     is linear between samples, the paper's equation takes the input at the sample before, as an environment does.
 
     Args:
-        inputs: (T, n) or (T, n, inputs).
+        inputs: (T, n).
         outputs: (T, n) or (T, n, sensors).
         truth: true parameters (n,).
         experiment: of the environments.
@@ -41,7 +41,7 @@ def estimate_with_other_estimators(
     Returns:
         Name of the estimator to `agents.evaluation.metrics.posterior_metrics`.
     """
-    u, y = np.swapaxes(inputs, 0, 1), np.swapaxes(outputs, 0, 1)
+    u, y = inputs.T, np.swapaxes(outputs, 0, 1)
     plant, interpolation, own_prior, process_noise, sensor_noises = plant_model_of(experiment, truth)
     rig = Rig(experiment.step, interpolation=interpolation, delay=0 if interpolation == "linear" else -1)
     estimators: dict[str, tuple[Belief, FloatArray]] = {}

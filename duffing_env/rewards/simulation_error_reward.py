@@ -9,7 +9,7 @@ The believed oscillator has the posterior's means for its coefficients. If it di
 The test input is a Schroeder multisine of `TEST_SAMPLES` samples: the first 20 multiples of 9.5 Hz at equal amplitude,
 so up to 191 Hz as the Silverbox's multisine. Its peak is half of ``max_input``, which moves the oscillators of the
 standard tracks by at most 0.35 V. Of several inputs each gets the multisine from another place of its period on, so
-that they can be told apart.
+that they can be distinguished.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class magnitude(_RealFunction):
 
 
 class _Branch(_RealFunction):
-    """One of two values, by a comparison; its derivative is that of the value."""
+    """One of two values, by a comparison; its derivative is the value's."""
 
     nargs = 4
 

@@ -58,7 +58,7 @@ def stage_input_rate(name: str, tag: str) -> str:
 
 
 def stage_inputs(model: Model, tag: str) -> dict[str, str]:
-    """What a differential equation uses of its inputs to its name at a stage of a Runge-Kutta step."""
+    """Inputs and their derivatives in a differential equation, to their names at a stage of a Runge-Kutta step."""
     names = (stage_input, stage_input_rate)
     return {written: names[order](name, tag) for written, (name, order) in model.acting_inputs.items()}
 

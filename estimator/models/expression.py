@@ -94,7 +94,7 @@ def parse(text: object, owner: str) -> ast.expr:
 
 
 def _fault(node: ast.AST) -> str:
-    """What a formula may not have, in words; empty for a formula."""
+    """The first part that is not allowed in a formula, in words; empty where all is allowed."""
     if name_of(node) is not None:
         return ""
     match node:

@@ -98,7 +98,7 @@ def _is_magnitude(node: ast.AST) -> bool:
 
 
 def _without_magnitudes(node: ast.AST) -> tuple[ast.AST, float]:
-    """What a formula is a power of, and the exponent, at the place where it is 0."""
+    """The base and the exponent of a formula that is a power, near the place where it is 0."""
     match node:
         case ast.Call(func=ast.Name(id="abs"), args=[inner]):
             return _without_magnitudes(inner)

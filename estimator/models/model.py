@@ -16,8 +16,14 @@ from functools import cached_property
 
 from estimator.models.expression import FUNCTIONS, input_derivative, names_in, names_in_expression, older_input, parse
 from estimator.models.finite_slopes import check_slopes
-from estimator.support import argument_checks
-from estimator.support.argument_checks import check_bool, check_integer, check_mapping, check_number, short_repr
+from estimator.support.argument_checks import (
+    check_bool,
+    check_choice,
+    check_integer,
+    check_mapping,
+    check_number,
+    short_repr,
+)
 
 #: Names of inputs, states, coefficients and sensors; names with capital letters belong to the engine.
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
@@ -48,7 +54,7 @@ class Model:
     A model has either ``rates`` (a differential equation) or ``next_state`` (a difference equation). All expressions
     are strings in the names of states, coefficients, inputs and constants and ``pi``, with ``sin``, ``cos``, ``tanh``,
     ``atan``, ``exp``, ``log``, ``sqrt``, ``abs``, ``sign``, ``min``, ``max`` and ``where(condition, a, b)``, whose
-    condition compares two expressions by ``<``, ``<=``, ``>`` or ``>=``. At a jump or a kink a derivative is that of
+    condition compares two expressions by ``<``, ``<=``, ``>`` or ``>=``. At a jump or a kink a derivative is taken from
     one side; of ``sign`` it is 0, and of ``abs`` at 0 it is 0. In a difference equation the input ``u`` is its newest
     value, which acts on the next state, and ``u[-1]`` and ``u[-2]`` are its values one and two samples before. In a
     differential equation ``derivative(u)`` is its time derivative, where an interpolation makes it continuous.
@@ -117,7 +123,7 @@ class Model:
         for field_name in ("states", "coefficients", "outputs", "inputs", "physical", "inverse", "initial_states"):
             check_mapping(field_name, getattr(self, field_name), str)
         check_mapping("dimensions", self.dimensions, Sequence)
-        argument_checks.check_choice("time", self.time, ("sample", "s"))
+        check_choice("time", self.time, ("sample", "s"))
         if self.time == "s" and self.next_state:
             raise ValueError("time must be 'sample' for a difference equation, but is 's'; leave it out")
         check_mapping("constants", self.constants)
@@ -271,7 +277,7 @@ class Model:
 
     @cached_property
     def acting_inputs(self) -> dict[str, tuple[str, int]]:
-        """What a differential equation uses of its inputs: name in expressions to the input and its order.
+        """Inputs and their derivatives in a differential equation: name in expressions to the input and its order.
 
         The inputs themselves have the order 0; the time derivatives that expressions contain have the order 1.
         """

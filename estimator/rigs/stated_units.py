@@ -33,7 +33,7 @@ def model_near_one(
         model: the model, usually with time in seconds.
         scales: sampling step, and the sizes of the numbers of inputs and outputs that become 1.
         mean: parameter to a typical value, in its unit.
-        channel_sizes: input or sensor to the size of its numbers, for the sizes of states; by default that of scales.
+        channel_sizes: input or sensor to the size of its numbers, for the sizes of states; by default from ``scales``.
         sizes: state to its size; by default `estimator.models.scaling.state_sizes` finds it.
 
     Raises:

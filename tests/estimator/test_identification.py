@@ -90,7 +90,7 @@ def test_gaps_clipped_samples_and_several_records():
 )
 def test_records_may_begin_in_any_motion(kind, delay):
     u, y = simulated(SOFT, samples=4096, kind=kind)
-    recorded = np.roll(u, -delay)  # recorded so many samples before it acts
+    recorded = np.roll(u, -delay)  # recorded before it acts
     pieces = [(recorded[k : k + 280], y[k : k + 280]) for k in np.arange(200, 3800, 300)]
     result = identify(rig_of(SOFT, kind, delay=delay), pieces)
     assert np.abs(deviations(result, SOFT[0])).max() < 4.5

@@ -52,7 +52,7 @@ def shaker_on(mass, step):
 def scaled_by_hand(rig, truth):
     """`SHAKER` with x in parts of the range X, v in X per sample, and coefficients in parts of the true ones.
 
-    And the factor from the strength of its process noise to that of `SHAKER`.
+    And the factor from the strength of its process noise to the strength in `SHAKER`.
     """
     m, c, k = truth.values()
     step, limit, span = rig.step, rig.scales.input, rig.scales.output
