@@ -110,7 +110,7 @@ class DuffingEnv(ExperimentEnv, gym.Env[Any, Any]):
     three updates for each ratio and sample; 9 ratios are enough. A pair such as (5, 5) gives the numbers of values of
     each noise, a factor of 3 apart, in all combinations: for two guesses that may be wrong independently. Observation,
     ``belief``, information and the rewards by the belief then use the mixture's mean and covariance; ``free_energy`` is
-    the free energy of the mixture. This needs ``structured`` and one sensor.
+    the free energy of the mixture. This needs ``structured``. Several sensors share the factor on their noises.
 
     ## Episode end
 

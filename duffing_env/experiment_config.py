@@ -87,7 +87,7 @@ class Experiment:
             check_number(
                 "terminated_return", self.terminated_return, -MAX_MAGNITUDE, MAX_MAGNITUDE, "None keeps what was gained"
             )
-        hypotheses = checked_noise_hypotheses(self.noise_hypotheses, self.factorisation, self.model, MAX_HYPOTHESES)
+        hypotheses = checked_noise_hypotheses(self.noise_hypotheses, self.factorisation, MAX_HYPOTHESES)
         object.__setattr__(self, "noise_hypotheses", hypotheses)
 
     @property
@@ -177,9 +177,10 @@ class Experiment:
         first_record, plant_fields = prior.record, dict(self.plant_params)
         if self.noise_hypotheses != 1:
             members = member_priors(prior, self.noise_hypotheses)
-            weights = initial_weights(members, self.likeliest_log_noise_ratio)
+            noises = members[:, -2 - 2 * model.n_outputs :]
+            weights = initial_weights(noises, self.likeliest_log_noise_ratio)
             first_record = mixture_record(members, len(model.names), weights)
-            plant_fields["hypothesis_priors"] = np.column_stack([members[:, -4:], weights])
+            plant_fields["hypothesis_priors"] = np.column_stack([noises, weights])
         precisions = first_record[-2 - 2 * model.n_outputs :]
         values: dict[str, Any] = {
             "max_input": self.max_inputs,

@@ -51,10 +51,10 @@ class OnlineEstimator:
         expectations: propagation of the Gaussian belief: ``first_order``, the default, by the derivative at its mean;
             ``sigma_points``, for wide beliefs, by cubature points.
         noise_hypotheses: number of ratios σ_w/σ_v, weighed by their evidence (`estimator.inference.noise_grid`),
-            structured only. With 1, the default, the ratio stays near the ratio of the priors of γ and ξ. 9 resolve it;
-            an odd number includes the priors' ratio. Each ratio takes three updates per sample, at three totals. Two
-            numbers, such as (5, 5), are the numbers of values of σ_w and of σ_v, a factor of 3 apart, in all
-            combinations, for noises that may each be wrong: by 9 times for 5 values and 27 times for 7.
+            structured only. With 1, the default, it stays near the ratio of the priors of γ and ξ. 9 resolve it; an odd
+            number includes the priors' ratio. Each ratio takes three updates per sample, at three totals. Two numbers,
+            such as (5, 5), are the numbers of values of σ_w and of σ_v, a factor of 3 apart, in all combinations, for
+            noises that may each be wrong: by 9 times for 5 values and 27 times for 7. Sensors keep their ratios.
 
     Raises:
         ValueError: naming the argument, the value and the remedy.

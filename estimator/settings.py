@@ -63,14 +63,14 @@ def checked_settings(model: Model, settings: EstimatorSettings) -> EstimatorSett
         iterations=int(settings.iterations),
         as_published=bool(settings.as_published),
         drift=float(settings.drift),
-        noise_hypotheses=checked_noise_hypotheses(settings.noise_hypotheses, settings.factorisation, model),
+        noise_hypotheses=checked_noise_hypotheses(settings.noise_hypotheses, settings.factorisation),
     )
 
 
 def checked_noise_hypotheses(
-    noise_hypotheses: object, factorisation: str, model: Model, maximum: int = _MAX_HYPOTHESES
+    noise_hypotheses: object, factorisation: str, maximum: int = _MAX_HYPOTHESES
 ) -> NoiseGridSize:
-    """Check one or two numbers of noise hypotheses for a factorisation and model; at most ``maximum`` in all.
+    """Check one or two numbers of noise hypotheses for a factorisation; at most ``maximum`` in all.
 
     Raises:
         ValueError: naming the option, the value and the remedy.
@@ -84,9 +84,9 @@ def checked_noise_hypotheses(
         raise ValueError(
             f"noise_hypotheses must be at most {maximum} in all, but are {noise_hypotheses}; (9, 9) are plenty"
         )
-    is_mean_field = factorisation == "mean_field"
-    if list(counts) != [1] and (is_mean_field or model.n_outputs > 1):
-        what = "factorisation='mean_field'" if is_mean_field else f"{model.name}, which has several sensors"
-        remedy = "use factorisation='structured'" if is_mean_field else "centre the priors of its noises with care"
-        raise ValueError(f"noise_hypotheses must be 1 for {what}, but is {noise_hypotheses}; {remedy}")
+    if list(counts) != [1] and factorisation == "mean_field":
+        raise ValueError(
+            f"noise_hypotheses must be 1 for factorisation='mean_field', but is {noise_hypotheses}; use "
+            f"factorisation='structured'"
+        )
     return (int(counts[0]), int(counts[1])) if len(counts) == 2 else int(counts[0])

@@ -58,7 +58,8 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
     row_of, model = block_layout(spec), spec.belief_model
     condition_block, member_rows = _compile_member_update(spec)
     record_size = len(belief_rows(model))
-    mix = compile_mixture(len(model.names)).mix
+    noises_size = 2 + 2 * model.n_outputs
+    mix = compile_mixture(len(model.names), 1 + model.n_outputs).mix
     variance_rows = tuple(member_rows[f"P_{c}_{c}"] * LANES for c in model.coefficients)
     weight_row, energy_row = member_rows["WEIGHT"] * LANES, member_rows[f"FREE_ENERGY_{spec.iterations - 1}"] * LANES
     free_energy_row, needs_reset = row_of.get("FREE_ENERGY", -1) * LANES, row_of["NEEDS_RESET"] * LANES
@@ -72,10 +73,10 @@ def compile_filter_bank(spec: KernelSpec) -> FilterBank:
         for m in range(count if env_index % LANES < n else 0):
             slot = m * n + env_index % LANES
             U, lane = members[first + slot // LANES], slot % LANES
-            for i in range(record_size - 4):
+            for i in range(record_size - noises_size):
                 U[i * LANES + lane] = params.prior[i]
-            for i in range(5):
-                U[(record_size - 4 + i) * LANES + lane] = params.hypothesis_priors[m, i]
+            for i in range(noises_size + 1):
+                U[(record_size - noises_size + i) * LANES + lane] = params.hypothesis_priors[m, i]
 
     @compile_inner
     def keep_waiting(U, before, W, n):

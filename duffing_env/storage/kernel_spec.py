@@ -111,7 +111,8 @@ class KernelParams(NamedTuple):
         input_delay: samples between a recorded input and the output it acts on.
         interleaved_envs: environments of a block whose members lie side by side
             (`duffing_env.kernel_stages.noise_filter_bank`).
-        hypothesis_priors: (members, 5) first shape and rate of γ and of ξ of each of several beliefs, and its weight.
+        hypothesis_priors: (members, 3 + 2 s) first shape and rate of γ and of each sensor's ξ of each of several
+            beliefs, and its weight, for s sensors.
     """
 
     max_input: npt.NDArray[np.float64]
@@ -168,7 +169,7 @@ def compile_unpacker(spec: KernelSpec) -> Any:
         size = sizes.get(name)
         packed_slice = f"packed[{offset}]" if size is None else f"packed[{offset}:{offset + size}]"
         if name == "hypothesis_priors":  # the last
-            packed_slice = f"packed[{offset}:].reshape(-1, 5)"
+            packed_slice = f"packed[{offset}:].reshape(-1, {3 + 2 * spec.belief_model.n_outputs})"
         fields.append({int: f"int({packed_slice})", bool: f"{packed_slice} != 0.0"}.get(field_type, packed_slice))
         offset += 1 if size is None else size
     return _compiled_unpacker(", ".join(fields))

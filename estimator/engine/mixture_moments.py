@@ -20,9 +20,6 @@ from typing import Any, NamedTuple
 from estimator.compilation.simd import LANES
 from estimator.engine.source_cache import load_generated
 
-#: Number of noises of a belief: process and sensor.
-N_NOISES = 2
-
 
 class MomentSums(NamedTuple):
     """Compiled sums over the members of mixtures, for several systems side by side.
@@ -42,15 +39,21 @@ class MomentSums(NamedTuple):
 
 
 @cache
-def compile_mixture_moments(n_quantities: int) -> MomentSums:
-    """Compile the sums for beliefs in ``n_quantities`` states and coefficients, of one sensor."""
-    code = load_generated("mixture", "moments", str(n_quantities), lambda: _source(n_quantities), {})
+def compile_mixture_moments(n_quantities: int, n_noises: int) -> MomentSums:
+    """Compile the sums for beliefs in ``n_quantities`` states and coefficients, with process noise and sensors' noises.
+
+    Args:
+        n_quantities: number of states and coefficients.
+        n_noises: number of noises: one more than sensors.
+    """
+    key = f"{n_quantities}-{n_noises}"
+    code = load_generated("mixture", "moments", key, lambda: _source(n_quantities, n_noises), {})
     return MomentSums(code.add, code.finish)
 
 
-def _source(n_quantities: int) -> str:
+def _source(n_quantities: int, n_noises: int) -> str:
     pairs = list(combinations_with_replacement(range(n_quantities), 2))
-    shapes = [n_quantities + len(pairs) + 2 * k for k in range(N_NOISES)]
+    shapes = [n_quantities + len(pairs) + 2 * k for k in range(n_noises)]
 
     def member(i: int) -> str:
         return f"B[{i * LANES} + at + LANE]"

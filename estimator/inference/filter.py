@@ -19,7 +19,7 @@ from estimator.inference.noise_grid import (
     noise_ratio_posterior,
     pack_into_lanes,
 )
-from estimator.inference.noise_mixture import compile_mixture
+from estimator.inference.noise_mixture import MixtureMoments, compile_mixture
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
@@ -73,7 +73,7 @@ class Filter:
     def _initial_weights(self, records: FloatArray) -> FloatArray:
         """(members,) weights before the first sample. With the prior of a rig's guess, both noises are unknown."""
         unknown = self.rig.guess is not None and isinstance(self.settings.noise_hypotheses, tuple)
-        return initial_weights(records, equal_effect_log_ratio(self.prior) if unknown else None)
+        return initial_weights(self._noises(records), equal_effect_log_ratio(self.prior) if unknown else None)
 
     def _compile_loop(self, members: int) -> filter_loop.FilterLoop:
         settings = self.settings
@@ -178,17 +178,26 @@ class Filter:
     @property
     def noise_ratio(self) -> NoiseRatio:
         """Posterior of the noise ratio, from the weights and the precisions of the members."""
-        weights, _ = compile_mixture(len(self.model.names)).mixture(self._block, self._weights)
-        ratios = np.array([log_noise_ratio(record[-4:]) for record in self.records[weights > 0]])
+        weights, _ = self._compiled_mixture.mixture(self._block, self._weights)
+        ratios = np.array([log_noise_ratio(noises) for noises in self._noises(self.records[weights > 0])])
         records = member_priors(self.prior, self.settings.noise_hypotheses)
-        first = np.array([log_noise_ratio(record[-4:]) for record in records])
+        first = np.array([log_noise_ratio(noises) for noises in self._noises(records)])
         return noise_ratio_posterior(weights[weights > 0], ratios, first, self._initial_weights(records))
+
+    @property
+    def _compiled_mixture(self) -> MixtureMoments:
+        """The moments of mixtures of the model's beliefs."""
+        return compile_mixture(len(self.model.names), 1 + self.model.n_outputs)
+
+    def _noises(self, records: FloatArray) -> FloatArray:
+        """(M, 2 + 2 s) shapes and rates of the precisions in records (M, size)."""
+        return records[:, -2 - 2 * self.model.n_outputs :]
 
     def _mixture_record(self) -> FloatArray:
         """(size,) record with the mixture's moments."""
         if self.members == 1:
             return self.records[0]
-        record: FloatArray = compile_mixture(len(self.model.names)).mixture(self._block, self._weights)[1]
+        record: FloatArray = self._compiled_mixture.mixture(self._block, self._weights)[1]
         return record
 
     @property
@@ -236,7 +245,7 @@ class Filter:
         else:
             record[:n] = state
         record[places] = cov
-        noises = record[-2 - 2 * self.model.n_outputs :]
+        noises = self._noises(record[None])[0]
         noises *= np.repeat(_CERTAIN_SHAPE / noises[::2], 2)
         # One iteration would be enough, but the loop with the filter's own number is compiled already.
         settings = replace(self.settings, drift=0.0, noise_hypotheses=1)
@@ -292,7 +301,7 @@ class Filter:
                 check_belief_record(name, self.model, record, _EIGENVALUE_TOLERANCE)
         if self.members > 1:  # the mixture's moments may overflow, or vanish, where no member's do
             blocks = pack_into_lanes(checked["records"], self._loop.lanes)
-            _, record = compile_mixture(len(self.model.names)).mixture(blocks, weights)
+            _, record = self._compiled_mixture.mixture(blocks, weights)
             check_belief_record("records", self.model, record, _EIGENVALUE_TOLERANCE)
         for name in ("weights", "first", "walk", "begun"):
             setattr(self, f"_{name}", checked[name])

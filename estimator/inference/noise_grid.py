@@ -11,6 +11,9 @@ weighed by their free energies, F_m of a sample for -log p(y_t | y_1 ... y_{t-1}
     w_m <- (1 - ε) w_m + ε/M                       the true hypothesis may change, once in 1/ε samples
     F = -log Σ_m w_m exp(-F_m),   w_m <- w_m exp(F - F_m)        (`estimator.inference.noise_mixture.reweight`)
 
+Several sensors share one unknown factor on their noises: their ratios stay as in the prior, and so do the ratios of
+several sources of process noise (`estimator.models.noise_ratios`).
+
 The belief has the mixture's mean and covariance of states and coefficients, and the mixture's mean and variance of the
 noise variances, which act in a prediction: so a hypothesis without noise does not make a precision infinite.
 
@@ -60,18 +63,19 @@ class NoiseRatio:
 
 
 def noise_grid(noises: FloatArray, grid_size: NoiseGridSize) -> FloatArray:
-    """(members, 4) shapes and rates of γ and ξ of all hypotheses, for one sensor.
+    """(members, 2 + 2 s) shapes and rates of γ and of each sensor's ξ of all hypotheses, for s sensors.
 
     Two numbers are for noises that may each be wrong: the numbers of values of σ_w and of σ_v, a factor of
     `GRID_FACTOR` apart about ``noises``, in all combinations. Five values reach a factor of 9, seven a factor of 27.
 
     One number is for noises of roughly known total: the number of ratios σ_w/σ_v, from 1/30 to 30 times the ratio of
     ``noises`` in equal logarithmic steps. Each ratio has three members, with √(σ_w² + σ_v²) as given, a third of it and
-    three times it.
+    three times it. Here σ_v is the first sensor's; the others' noises are scaled by its factor.
     """
     if isinstance(grid_size, tuple):
         process, sensor = (GRID_FACTOR ** (2 * np.arange(count) - (count - 1.0)) for count in grid_size)
-        return np.array([noises * [1.0, a, 1.0, b] for a in process for b in sensor])
+        n_sensors = len(noises) // 2 - 1
+        return np.array([noises * [1.0, a, *[1.0, b] * n_sensors] for a in process for b in sensor])
     factors = np.geomspace(1 / MAX_RATIO_FACTOR, MAX_RATIO_FACTOR, grid_size)
     return np.array([scale_noise_gammas(noises, factor, level) for level in TOTAL_STD_FACTORS for factor in factors])
 
@@ -82,24 +86,22 @@ def member_priors(prior: Belief, grid_size: NoiseGridSize) -> FloatArray:
         return prior.record[None].copy()
     noises = noise_grid(prior.noises, grid_size)
     records = np.repeat(prior.record[None], len(noises), axis=0)
-    records[:, -4:] = noises
+    records[:, -noises.shape[1] :] = noises
     return records
 
 
-def initial_weights(records: FloatArray, log_ratio_center: float | None = None) -> FloatArray:
-    """(M,) weights of members (M, size) before the first sample.
+def initial_weights(noises: FloatArray, log_ratio_center: float | None = None) -> FloatArray:
+    """(M,) weights of members before the first sample.
 
     Args:
-        records: their records.
+        noises: (M, 2 + 2 s) shapes and rates of their precisions.
         log_ratio_center: log(σ_w/σ_v) of noises with equal effect on the output: the weights are then a half-Cauchy
             density about it (`neg_log_half_cauchy`). None is even weights: either noise may then be near 0, and
             intervals become too narrow if the samples cannot contradict that.
     """
     if log_ratio_center is None:
-        return np.full(len(records), 1 / len(records))
-    weights = np.exp(
-        -neg_log_half_cauchy(np.array([log_noise_ratio(record[-4:]) for record in records]) - log_ratio_center)
-    )
+        return np.full(len(noises), 1 / len(noises))
+    weights = np.exp(-neg_log_half_cauchy(np.array([log_noise_ratio(one) for one in noises]) - log_ratio_center))
     return np.asarray(weights / weights.sum())
 
 
@@ -113,7 +115,8 @@ def neg_log_half_cauchy(log_deviation: FloatArray) -> FloatArray:
 
 def mixture_record(records: FloatArray, n_quantities: int, weights: FloatArray) -> FloatArray:
     """(size,) record of the mixture of members (M, size) with weights (M,), for ``n_quantities`` means."""
-    record: FloatArray = compile_mixture(n_quantities).mixture(pack_into_lanes(records, LANES), weights)[1]
+    n_noises = (records.shape[1] - n_quantities * (n_quantities + 3) // 2) // 2
+    record: FloatArray = compile_mixture(n_quantities, n_noises).mixture(pack_into_lanes(records, LANES), weights)[1]
     return record
 
 
@@ -125,17 +128,20 @@ def pack_into_lanes(records: FloatArray, lanes: int) -> FloatArray:
 
 
 def scale_noise_gammas(noises: FloatArray, ratio_factor: float, total_std_factor: float) -> FloatArray:
-    """(4,) shapes and rates with σ_w/σ_v scaled by ``ratio_factor`` and σ_w² + σ_v² by ``total_std_factor``²."""
+    """(2 + 2 s,) shapes and rates with σ_w/σ_v scaled by ``ratio_factor`` and σ_w² + σ_v² by ``total_std_factor``².
+
+    σ_v is the first sensor's; the variances of the others are scaled by its factor.
+    """
     q, r = noises[1] / noises[0], noises[3] / noises[2]
     ratio, total = ratio_factor**2 * q / r, total_std_factor**2 * (q + r)
     scaled = noises.copy()
     scaled[1] = noises[0] * total * ratio / (1 + ratio)
-    scaled[3] = noises[2] * total / (1 + ratio)
+    scaled[3::2] = noises[2::2] * total / (1 + ratio) * (noises[3::2] / noises[2::2] / r)
     return scaled
 
 
 def log_noise_ratio(noises: FloatArray) -> float:
-    """log(σ_w/σ_v) at the mean precisions."""
+    """log(σ_w/σ_v) at the mean precisions, with the first sensor's noise."""
     return float(0.5 * np.log(noises[1] / noises[0] / (noises[3] / noises[2])))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from estimator.compilation.array_operations import fill
 from estimator.compilation.elementary_functions import exp, log
 from estimator.compilation.simd import LANES, jit, jit_closure, kernel
-from estimator.engine.mixture_moments import N_NOISES, compile_mixture_moments
+from estimator.engine.mixture_moments import compile_mixture_moments
 
 #: Probability per sample that the true hypothesis is drawn anew [1]; it bounds the weights from below.
 SWITCHING_PROBABILITY = 1e-6
@@ -124,12 +124,18 @@ class MixtureMoments(NamedTuple):
 
 
 @cache
-def compile_mixture(n_quantities: int) -> MixtureMoments:
-    """Compile the moments of mixtures of beliefs in ``n_quantities`` states and coefficients, of one sensor."""
-    moments, jit_variant = compile_mixture_moments(n_quantities), jit_closure(str(n_quantities))
+def compile_mixture(n_quantities: int, n_noises: int = 2) -> MixtureMoments:
+    """Compile the moments of mixtures of beliefs in ``n_quantities`` states and coefficients.
+
+    Args:
+        n_quantities: number of states and coefficients.
+        n_noises: number of noises: one more than sensors.
+    """
+    variant = f"{n_quantities}_{n_noises}"
+    moments, jit_variant = compile_mixture_moments(n_quantities, n_noises), jit_closure(variant)
     add, finish = moments.add, moments.finish
     first_shape = n_quantities + n_quantities * (n_quantities + 1) // 2
-    size = first_shape + 2 * N_NOISES
+    size = first_shape + 2 * n_noises
 
     @jit_variant
     def refer_to_likeliest(blocks, first, weights, n, A):
@@ -155,7 +161,7 @@ def compile_mixture(n_quantities: int) -> MixtureMoments:
             for j in range(n):
                 records[i * stride + j] = X[i * LANES + j] if weights[j] >= 0.0 else np.nan
 
-    @kernel(variant=str(n_quantities))
+    @kernel(variant=variant)
     def mixture(blocks, weights):
         kept, record = np.empty(len(weights)), np.empty(size)
         total = 0.0

@@ -65,10 +65,31 @@ def motion(u, coefficients, interpolation="linear"):
     return states
 
 
-def pendulum_estimator():
+def pendulum_prior(**noises):
+    """The prior of a model with two sensors."""
+    return weak_prior(PENDULUM, [14.7 * 0.05**2, 0.0, 3.0 * 0.05**2], np.diag([1e-6, 1e-6, 1e-6]), **noises)
+
+
+def pendulum_estimator(prior=None, **options):
     """One of a model with two sensors."""
-    prior = weak_prior(PENDULUM, [14.7 * 0.05**2, 0.0, 3.0 * 0.05**2], np.diag([1e-6, 1e-6, 1e-6]), 1e-3, 1e-3)
-    return OnlineEstimator(PENDULUM, prior, Rig(prior.step, "linear"))
+    prior = prior or pendulum_prior(process_noise=1e-3, measurement_noise=1e-3)
+    return OnlineEstimator(PENDULUM, prior, Rig(prior.step, "linear"), **options)
+
+
+def pendulum_record(samples, noise):
+    """True coefficients, inputs (T,) and outputs (T, 2) of a pendulum whose sensors have these standard deviations."""
+    rng = np.random.default_rng(0)
+    truth = np.array([14.7, 0.02, 3.0]) * [0.05**2, 0.05, 0.05**2]
+    u, state, y = rng.uniform(-2, 2, samples), np.zeros(2), np.empty((samples, 2))
+    last = 0.0
+    for t in range(samples):
+        for i in range(50):
+            force = last + (u[t] - last) * (i + 0.5) / 50
+            middle = state[1] + (truth[2] * force - truth[1] * state[1] - truth[0] * np.sin(state[0])) / 100
+            slope = truth[2] * force - truth[1] * middle - truth[0] * np.sin(state[0] + state[1] / 100)
+            state = state + np.array([middle, slope]) / 50
+        last, y[t] = u[t], state + noise * rng.standard_normal(2)
+    return truth, u, y
 
 
 def assert_same(first, second):

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from estimators import AHEAD, record
+from estimators import AHEAD, pendulum_estimator, pendulum_prior, pendulum_record, record
 from reference.filters import carried, difference_step
 from reference.mixture import hypotheses, weighed
 from reference.mixture import mixed as mixture_of
@@ -21,6 +21,7 @@ from estimator.inference.noise_grid import (
     initial_weights,
     member_priors,
     moment_matched_gamma,
+    noise_grid,
     pack_into_lanes,
     scale_noise_gammas,
 )
@@ -32,6 +33,7 @@ from estimator.inference.noise_mixture import (
     mark_diverged,
     reweight,
 )
+from estimator.models.pendulum import PENDULUM
 from estimator.rigs.rig_prior import rig_prior
 
 RATIOS = 5
@@ -138,14 +140,25 @@ def test_displacement_keeps_the_shapes_and_says_ratio_and_sum():
     np.testing.assert_allclose(scale_noise_gammas(noises, 1.0, 1.0), noises, rtol=1e-14)
 
 
+def test_sensors_share_one_unknown_factor():
+    noises = np.array([2.0, 2.0 * 3e-3**2, 5.0, 5.0 * 1e-3**2, 7.0, 7.0 * 4e-3**2])
+    first = noises[:4]
+    for grid_size in (3, (3, 2)):
+        several, single = noise_grid(noises, grid_size), noise_grid(first, grid_size)
+        np.testing.assert_array_equal(several[:, :4], single)
+        np.testing.assert_allclose(several[:, 5], 7 / 5 * 4**2 * several[:, 3], rtol=1e-14)
+        assert (several[:, 4] == 7.0).all()
+
+
 def test_first_weights_are_half_a_cauchy_density_of_the_ratio():
     records = member_priors(silverbox_prior(), (3, 1))
     middle = np.log(2e-3)
     ratios = np.sqrt(records[:, -3] / records[:, -4] / (records[:, -1] / records[:, -2]))
     # A density of the logarithm is that of the ratio, 1/(1 + (ratio/scale)²), times the ratio.
     density = ratios / (1 + (ratios / np.exp(middle)) ** 2)
-    np.testing.assert_allclose(initial_weights(records, middle), density / density.sum(), rtol=1e-12)
-    np.testing.assert_array_equal(initial_weights(records), [1 / 3] * 3)
+    noises = records[:, -4:]
+    np.testing.assert_allclose(initial_weights(noises, middle), density / density.sum(), rtol=1e-12)
+    np.testing.assert_array_equal(initial_weights(noises), [1 / 3] * 3)
 
 
 def test_only_a_rig_with_a_guess_says_where_noises_are_likely():
@@ -178,19 +191,19 @@ def test_a_matched_gamma_has_the_mixtures_variance_and_its_spread():
     )
 
 
-@table("n", [1, 8, 32])
+@table(("n_noises", "n"), [(2, 1), (2, 8), (2, 32), (4, 8)])
 @table("members", [1, 21, 40])
-def test_mixtures_have_the_moments_of_their_finite_members(members, n):
+def test_mixtures_have_the_moments_of_their_finite_members(members, n, n_noises):
     """Of one system or of several beside each other, also over many blocks; to the last bit the same."""
     names, rng = 6, np.random.default_rng(members)
     means, roots = rng.standard_normal((members, n, names)), rng.standard_normal((members, n, names, names))
-    covs, noises = roots @ roots.swapaxes(2, 3), rng.uniform(1.0, 5.0, (members, n, 4))
+    covs, noises = roots @ roots.swapaxes(2, 3), rng.uniform(1.0, 5.0, (members, n, 2 * n_noises))
     upper = np.triu_indices(names)
     records = np.concatenate([means, covs[:, :, upper[0], upper[1]], noises], axis=2)
     weights = rng.dirichlet(np.ones(members), n).T.copy()
     if members > 1:
         records[1, :, 8], records[2, : n // 2 + 1, 0], weights[3] = np.nan, np.inf, 0.0
-    found, size = compile_mixture(names), records.shape[2]
+    found, size = compile_mixture(names, n_noises), records.shape[2]
     before = np.full((LANES, size), np.nan)
     blocks = pack_into_lanes(np.concatenate([before, records.reshape(-1, size)]), LANES)
     finite = np.isfinite(records).all(axis=2)
@@ -202,7 +215,9 @@ def test_mixtures_have_the_moments_of_their_finite_members(members, n):
         mean = own @ means[kept, j]
         off = means[kept, j] - mean
         cov = np.einsum("m,mij->ij", own, covs[kept, j] + off[:, :, None] * off[:, None, :])
-        gammas = [moment_matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in (0, 2)]
+        gammas = [
+            moment_matched_gamma(own, noises[kept, j, k], noises[kept, j, k + 1]) for k in range(0, 2 * n_noises, 2)
+        ]
         expected = np.concatenate([mean, cov[upper], *gammas])
         np.testing.assert_allclose(mixed_records[:, j], expected, rtol=1e-12, atol=1e-13)
         of_one, record = found.mixture(pack_into_lanes(records[:, j], LANES), weights[:, j].copy())
@@ -274,6 +289,31 @@ def test_members_with_sigma_points_are_estimators_of_their_own(samples):
     np.testing.assert_allclose((estimator.belief.coefficients_cov - cov) / np.outer(std, std), 0, atol=1e-5)
     variance = weights @ [1 / belief.gamma_mean for belief in beliefs]
     assert 1 / estimator.belief.gamma_mean == pytest.approx(variance, rel=1e-8)
+
+
+def test_hypotheses_of_two_sensors_are_weighed_by_both():
+    noise = np.array([1e-3, 8e-3])
+    truth, u, y = pendulum_record(200, noise)
+    prior = pendulum_prior(process_noise=3e-4, measurement_noise=noise / 3)
+    estimator = pendulum_estimator(prior, noise_hypotheses=(3, 3), expectations="sigma_points")
+    alone = []
+    for noises in member_priors(prior, (3, 3))[:, -6:]:
+        moved = Belief.of(PENDULUM, prior.mean, prior.cov, noises[:2], (noises[2:4], noises[4:]))
+        alone.append(pendulum_estimator(moved, expectations="sigma_points"))
+    weights, expected = np.full(9, 1 / 9), []
+    for sample in np.array([each.run(u, y)[:, -1] for each in alone]).T:
+        weights, energy = weighed(weights, sample)
+        expected.append(energy)
+    np.testing.assert_allclose(estimator.run(u, y)[:, -1], expected, rtol=1e-9, atol=1e-9)
+    std = np.sqrt(np.diag(estimator.belief.coefficients_cov))
+    mean = weights @ np.array([each.belief.coefficients_mean for each in alone])
+    np.testing.assert_allclose((estimator.belief.coefficients_mean - mean) / std, 0, atol=1e-6)
+    # The sensors' true factor is 3; a filter each about the mixture's mean finds it as well.
+    shared = pendulum_estimator(prior, noise_hypotheses=(3, 3))
+    shared.run(u, y)
+    for found in (estimator, shared):
+        np.testing.assert_allclose(np.sqrt(found.belief.noises[3::2] / found.belief.noises[2::2]), noise, rtol=0.2)
+        assert (np.abs(found.belief.coefficients_mean - truth) < 4 * std).all()
 
 
 @ANY_MODEL

@@ -6,7 +6,18 @@ import re
 
 import numpy as np
 import pytest
-from estimators import KINDS, ODE, ONE_TAP, OWN_TAPS, TRUTH, assert_same, motion, pendulum_estimator, record
+from estimators import (
+    KINDS,
+    ODE,
+    ONE_TAP,
+    OWN_TAPS,
+    TRUTH,
+    assert_same,
+    motion,
+    pendulum_estimator,
+    pendulum_record,
+    record,
+)
 from tables import table
 
 from estimator import (
@@ -304,17 +315,7 @@ def test_spline_takes_records_and_no_samples(samples, monkeypatch):
 
 
 def test_two_sensors():
-    rng = np.random.default_rng(0)
-    truth = np.array([14.7, 0.02, 3.0]) * [0.05**2, 0.05, 0.05**2]
-    u, state, y = rng.uniform(-2, 2, 400), np.zeros(2), np.empty((400, 2))
-    last = 0.0
-    for t in range(400):
-        for i in range(50):
-            force = last + (u[t] - last) * (i + 0.5) / 50
-            middle = state[1] + (truth[2] * force - truth[1] * state[1] - truth[0] * np.sin(state[0])) / 100
-            slope = truth[2] * force - truth[1] * middle - truth[0] * np.sin(state[0] + state[1] / 100)
-            state = state + np.array([middle, slope]) / 50
-        last, y[t] = u[t], state + 1e-3 * rng.standard_normal(2)
+    truth, u, y = pendulum_record(400, 1e-3)
     estimator, single = pendulum_estimator(), pendulum_estimator()
     free_energies = estimator.run(u, y)
     for u_t, y_t in zip(u, y, strict=True):
