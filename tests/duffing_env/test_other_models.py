@@ -1,10 +1,13 @@
 """Environments of other models than the oscillator's, and of one's own with two sensors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from playing import random_actions
 from reference.filters import Plant, moved
-from specimens import COMPILED, SEEN_TWICE
+from reference.plants import ASYMMETRIC_SPRING
+from specimens import COMPILED, SEEN_TWICE, SPECIMENS
 
 from duffing_env.tracks.model_env import ModelEnv, ModelExperiment
 from estimator.models.named_parameters import Parameters
@@ -97,3 +100,12 @@ def test_a_spread_is_not_ignored_where_deviations_say_how_plants_are_drawn():
         ModelEnv(**options, plant_spread=0.1)
     assert not ModelExperiment(**options, plant_spread=0.0).kernel_params.parameter_stds.any()
     assert ModelExperiment(**options).kernel_params.parameter_stds.tolist() == [0.3, 0.1, 0.3]
+
+
+def test_a_limit_as_good_as_none_leaves_a_model_in_seconds_finite():
+    # Its states are in parts of the limit, whose square is in the cubic coefficient.
+    system = replace(ASYMMETRIC_SPRING, time="s", states={"x": "V", "v": "V/s"})
+    options = SPECIMENS["asymmetric spring"] | {"system": system, "max_output": 1e300}
+    env = ModelEnv(**options)
+    env.reset(seed=0)
+    assert np.isfinite(env.step([0.5])[0]).all()

@@ -53,6 +53,77 @@ TWO_MASSES = Model(
     outputs={"y1": "x1", "y2": "x2"},
 )
 
+#: A first-order lag.
+LAG = Model(
+    name="lag",
+    states={"x": "V"},
+    coefficients={"decay": "1", "gain": "1"},
+    rates=("gain*u - decay*x",),
+    noise=("1",),
+    outputs={"y": "x"},
+)
+
+#: A spring that is not symmetric about rest.
+ASYMMETRIC_SPRING = Model(
+    name="asymmetric_spring",
+    states={"x": "V", "v": "V"},
+    coefficients={"stiffness": "1", "quadratic": "V⁻¹", "cubic": "V⁻²", "damping": "1", "gain": "1"},
+    rates=("v", "gain*u - damping*v - stiffness*x - quadratic*x**2 - cubic*x**3"),
+    noise=("0", "sqrt(3)"),
+    outputs={"y": "x"},
+    substeps=4,
+)
+
+#: Friction that hardly depends on the speed, and turns over within the creep.
+DRY_FRICTION = Model(
+    name="dry_friction",
+    states={"x": "V", "v": "V"},
+    coefficients={"stiffness": "1", "friction": "V", "damping": "1", "gain": "1"},
+    constants={"creep": 0.02},
+    rates=("v", "gain*u - damping*v - stiffness*x - friction*tanh(v/creep)"),
+    noise=("0", "sqrt(3)"),
+    outputs={"y": "x"},
+    substeps=4,
+)
+
+#: The hysteresis of Bouc and Wen, whose force z follows the displacement and is lost to friction.
+BOUC_WEN = Model(
+    name="bouc_wen",
+    states={"x": "V", "v": "V", "z": "V"},
+    coefficients={"stiffness": "1", "hysteresis": "1", "damping": "1", "gain": "1", "loss": "V⁻¹"},
+    rates=("v", "gain*u - damping*v - stiffness*x - hysteresis*z", "v - loss*(abs(v)*z + 0.5*v*abs(z))"),
+    noise=("0", "sqrt(3)", "0"),
+    outputs={"y": "x"},
+    substeps=4,
+)
+
+_TORQUE_1 = "(t1 - drag*w1 + m2*l1*l2*sin(q2)*(2*w1*w2 + w2**2) - g*((m1 + m2)*l1*sin(q1) + m2*l2*sin(q1 + q2)))"
+_TORQUE_2 = "(t2 - drag*w2 - m2*l1*l2*sin(q2)*w1**2 - g*m2*l2*sin(q1 + q2))"
+_INERTIA_11 = "((m1 + m2)*l1**2 + m2*l2**2 + 2*m2*l1*l2*cos(q2))"
+_INERTIA_12, _INERTIA_22 = "(m2*l2**2 + m2*l1*l2*cos(q2))", "(m2*l2**2)"
+_DETERMINANT = "(m2*l2**2*l1**2*(m1 + m2*sin(q2)**2))"
+
+#: The double pendulum of IO-SMC² (Iqbal et al., ICML 2024), with point masses and a torque on each joint. The second
+#: angle is relative to the first arm.
+DOUBLE_PENDULUM = Model(
+    name="double_pendulum",
+    time="s",
+    states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+    coefficients={"m1": "kg", "m2": "kg", "l1": "m", "l2": "m"},
+    inputs={"t1": "N m", "t2": "N m"},
+    constants={"g": 9.81, "drag": 0.1},
+    rates=(
+        "w1",
+        "w2",
+        f"({_INERTIA_22}*{_TORQUE_1} - {_INERTIA_12}*{_TORQUE_2})/{_DETERMINANT}",
+        f"({_INERTIA_11}*{_TORQUE_2} - {_INERTIA_12}*{_TORQUE_1})/{_DETERMINANT}",
+    ),
+    noise=("0", "0", "1", "1"),
+    independent_noise=True,
+    outputs={"angle1": "q1", "angle2": "q2"},
+    substeps=4,
+)
+
 #: Model, interpolation, coefficients, scale of the input.
 CASES = {
     "paper": (difference(), "zero_order", [1.48, -1.47, -0.939, 0.39], 0.12),
