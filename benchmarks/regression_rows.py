@@ -58,7 +58,7 @@ def record_of(rig: Rig) -> tuple[Any, Any]:
     rng = np.random.default_rng(3)
     middle = {name: float(np.mean(interval)) for name, interval in (rig.guess or {}).items()}
     m, c, a, b = (middle.get(name, default) for name, default in zip("mcab", (1.7e-5, 2.8e-4, 1.0, 4.0), strict=True))
-    u = 0.3 * (rig.input.limit or 0.1) * np.repeat(rng.choice([-1.0, 1.0], 150), 4)
+    u = 0.3 * (rig.inputs["u"].limit or 0.1) * np.repeat(rng.choice([-1.0, 1.0], 150), 4)
     x = 0.0 if a > 0 else float(np.sqrt(-a / b))
     v, seen = 0.0, []
     fine = 200

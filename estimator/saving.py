@@ -43,7 +43,7 @@ def save_estimator(estimator: OnlineEstimator, path: str | Path) -> None:
         "format": FILE_FORMAT,
         "model": estimator.model.to_dict(),
         "rig": estimator.rig.to_dict(),
-        "scales": asdict(estimator.scales),
+        "scales": estimator.scales.to_dict(),
         "settings": asdict(estimator.settings),
     }
     text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)

@@ -101,7 +101,8 @@ def print_experiment_design(design: ExperimentDesign) -> None:
                 row.unit,
             ]
         )
-    description = f"{len(design.u)} samples by {design.policy}, up to {abs(design.u).max():.3g} {design.rig.input.unit}"
+    unit = design.rig.only_input.unit
+    description = f"{len(design.u)} samples by {design.policy}, up to {abs(design.u).max():.3g} {unit}"
     description += f", scaled by {design.scale:.2g} to be safe" if design.scale < 1 else ""
     print_all(
         format_table(("", "mean", "90 % interval now", "expected after", "times narrower", "unit"), rows),

@@ -197,12 +197,13 @@ def plot_experiment_design(experiment_design: ExperimentDesign) -> Figure:
     low, median, high = experiment_design.output_quantiles
     above.plot(time, experiment_design.u, color=_COLOURS[0], linewidth=1.0, zorder=3, drawstyle="steps-post")
     above.set(
-        ylabel=f"input / {rig.input.unit}", title=f"{len(experiment_design.u)} samples by {experiment_design.policy}"
+        ylabel=f"input / {rig.only_input.unit}",
+        title=f"{len(experiment_design.u)} samples by {experiment_design.policy}",
     )
     below.fill_between(time, low, high, color=_COLOURS[1], alpha=0.3, linewidth=0, label="expected, 90 %")
     below.plot(time, median, color=_COLOURS[1], linewidth=0.8, label="expected, median")
     below.set(xlabel="time / s", ylabel=f"output / {rig.output.unit}")
-    for axes, limit in ((above, rig.input.limit), (below, rig.output.range)):
+    for axes, limit in ((above, rig.only_input.limit), (below, rig.output.range)):
         lower_upper = limit * np.array([-1.0, 1.0])
         axes.hlines(lower_upper, *time[[0, -1]], color="black", linestyle="--", linewidth=0.8, zorder=1, label="limits")
         axes.grid(alpha=0.3)

@@ -69,7 +69,7 @@ class EnvView:
             prior.noises[::2] / prior.noises[1::2]
         )
         if np.isnan(y):
-            y = output_at(belief.model, belief.coefficients_mean, belief.state_mean, np.asarray(u).item())
+            y = output_at(belief.model, belief.coefficients_mean, belief.state_mean, u)
         values = np.concatenate([
             (belief.coefficients_mean - prior.coefficients_mean) / prior_stds,
             np.log(stds / prior_stds),

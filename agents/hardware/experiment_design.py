@@ -74,7 +74,7 @@ class ExperimentDesign:
 
     def write(self, path: Path) -> None:
         """Write a CSV file with time [s] and input, in the format that `identify` reads."""
-        name = name_with_unit(self.rig.input.column or "u", self.rig.input.unit)
-        lines = [f"time [s],{name if unit_in_name(name) else f'{name} [{self.rig.input.unit}]'}"]
+        name = name_with_unit(self.rig.only_input.column or "u", self.rig.only_input.unit)
+        lines = [f"time [s],{name if unit_in_name(name) else f'{name} [{self.rig.only_input.unit}]'}"]
         lines += [f"{k * self.rig.step:.9g},{value:.12g}" for k, value in enumerate((self.u + 0.0).tolist())]
         write_atomically(path, "\n".join(lines) + "\n")

@@ -282,11 +282,11 @@ def _prior_conflict_warning(rig: Rig, belief: Belief, samples_path: Path) -> str
     with samples_path.open(encoding="utf-8") as lines:
         if sum(1 for _ in lines) <= _MIN_OUTPUTS_FOR_NOISE:
             return ""
-    table = read_table(samples_path, rig.input.column, rig.output.column)
+    table = read_table(samples_path, rig.only_input.column, rig.output.column)
     u, y = table.inputs, table.columns[table.output_column]
     if np.isfinite(y).sum() < _MIN_OUTPUTS_FOR_NOISE:
         return ""
-    warning = disturbance_message(rig.input, float(np.sqrt(np.nanmean(u**2))), disturbance_std(belief))
+    warning = disturbance_message(rig.only_input, float(np.sqrt(np.nanmean(u**2))), disturbance_std(belief))
     if not warning:
         return ""
     return f"{warning}; the equation does not hold, or the prior is wrong: identify {samples_path} alone"

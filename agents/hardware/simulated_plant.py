@@ -70,7 +70,7 @@ class SimulatedPlant:
             raise ValueError(f"rig must have a delay of 0 to be simulated here, but has {rig.delay}; set it to 0")
         self.truth = dict(truth) if truth is not None else {k: sum(v) / 2 for k, v in (rig.guess or {}).items()}
         self.rig, self.clock = rig, RealClock() if clock is None else clock
-        channels = ((rig.input, rig.input.limit), (rig.output, rig.output.range))
+        channels = ((rig.only_input, rig.only_input.limit), (rig.output, rig.output.range))
         self._noise_stds = [
             _DEFAULT_NOISE_RATIO * (limit or 0.0) if channel.noise is None else channel.noise
             for channel, limit in channels
@@ -128,7 +128,7 @@ class SimulatedPlant:
         self._armed = False
 
     def _clamp_input(self, u: float) -> float:
-        limit = self.rig.input.limit or math.inf
+        limit = self.rig.only_input.limit or math.inf
         applied = min(max(u, -limit), limit) if self._armed else 0.0
         self._has_been_driven |= applied != 0.0
         return applied
@@ -179,7 +179,7 @@ class SimulatedPlant:
 
     def _acceleration(self, x: float, v: float) -> float:
         m, c, a, b = (self.truth[name] for name in "mcab")
-        force = self._u - self.rig.input.offset + self._process_noise_force
+        force = self._u - self.rig.only_input.offset + self._process_noise_force
         return (force - c * v - a * x - b * x * x * x) / m
 
 

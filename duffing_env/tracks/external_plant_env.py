@@ -66,7 +66,7 @@ def playable_rig(rig: RigLike | None, needs_guess: bool = True) -> Rig:
     if rig is None:
         raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
     rig = Rig.from_any(rig)
-    needed = {"input.limit": rig.input.limit, "output.range": rig.output.range, "guess": rig.guess}
+    needed = {"input.limit": rig.only_input.limit, "output.range": rig.output.range, "guess": rig.guess}
     for name, given in needed.items():
         if given is None and (needs_guess or name != "guess"):
             raise ValueError(f"rig must have {name} to be played, but has none; add it to the rig")

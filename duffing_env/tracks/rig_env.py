@@ -50,7 +50,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
         rig = playable_rig(self.rig)
         object.__setattr__(self, "rig", rig)
         for name, channel, scale in (
-            ("process_noise", rig.input, rig.scales.input),
+            ("process_noise", rig.only_input, rig.scales.input),
             ("measurement_noise", rig.output, rig.scales.output),
         ):
             if getattr(self, name) is None:
@@ -86,7 +86,7 @@ class RigExperiment(RigScaling, SimulatedExperiment):
         }
         low, high = rig.guess["m"]
         outside |= {
-            "u0": (rig.input.offset, OFFSET_STD_FRACTION * scales.input),
+            "u0": (rig.only_input.offset, OFFSET_STD_FRACTION * scales.input),
             "y0": (rig.output.offset, OFFSET_STD_FRACTION * scales.output),
         }
         inside = {}

@@ -116,7 +116,7 @@ def _choose_scales(rig: Rig, records: list[Record]) -> Scales:
         return replace(scales, input=scales.displacement / rig.step**2)
     return replace(
         scales,
-        input=scales.input if rig.input.limit else largest_input,
+        input=scales.input if rig.only_input.limit else largest_input,
         output=scales.output if rig.output.range else largest_output,
     )
 

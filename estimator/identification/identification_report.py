@@ -114,7 +114,7 @@ def _parameters_html(content: ReportContent) -> str:
         label = f"{name}, {_PARAMETER_MEANINGS[name]}"
         rows.append([label, mean_text, f"{std:.2g}", interval, escape(content.units[name])])
     channels = (
-        ("input", "disturbance of the force", content.rig.input),
+        ("input", "disturbance of the force", content.rig.only_input),
         ("output", "noise of the sensor", content.rig.output),
     )
     for name, label, channel in channels:

@@ -76,7 +76,7 @@ def draw_fit(rig: Rig, record: Record, forecast: FloatArray, free_run: FloatArra
     measured, free_run, output = record.y[:count], free_run[:count, 0], rig.output
     input_axis, output_axis, free_run_error_axis, forecast_error_axis = axes[:, 0]
     input_axis.step(seconds, record.u[:count], where="post", color="#555", linewidth=0.8)
-    input_axis.set_ylabel(figure_label(f"input [{rig.input.unit}]"))
+    input_axis.set_ylabel(figure_label(f"input [{rig.only_input.unit}]"))
     output_axis.plot(seconds, measured, color="#bbb", linewidth=4, label="measured")
     output_axis.plot(seconds, forecast[:count, 0], color="#06c", linewidth=1.2, label="forecast, one sample ahead")
     label = f"free run after {FREE_RUN_OUTPUTS} samples"

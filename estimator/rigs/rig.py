@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from estimator.models.duffing import DERIVATIVE_ORDER_OF_SENSOR, PARAMETER_DIMEN
 from estimator.models.interpolation import INTERPOLATION_DEGREES
 from estimator.models.model import Model
 from estimator.rigs.channel import Channel
+from estimator.rigs.rig_channels import check_keys, checked_inputs, checked_output
 from estimator.rigs.rig_toml import rig_file_text
-from estimator.rigs.units import MAGNITUDE_BOUNDS, Scales, sensor_kind_of_unit
-from estimator.support.argument_checks import check_choice, check_integer, check_number, did_you_mean, short_repr
+from estimator.rigs.units import MAGNITUDE_BOUNDS, Scales
+from estimator.support.argument_checks import check_choice, check_integer, check_number, short_repr
 from estimator.support.file_io import check_readable_file, to_path, write_atomically
 
 #: Interpolations that allow a fractional delay.
@@ -52,7 +53,7 @@ class Rig:
         delay: additional delay of the input [samples]. The newest tap of a difference equation acts on y[k] with
             u[k - delay]: 1 for the paper's in recorded data. -1 is for ``zero_order`` alone, with the pairs of an
             environment: u[k] acts before y[k]. `identify` takes fractional delays, above -1.
-        input: the input channel.
+        input: the input channel; of several inputs a mapping from the model's names to their channels, in its order.
         output: the output channel.
         guess: parameter m, c, a, b to the central 90 % interval of its prior, in the units of the channels; any sign is
             possible, but m is positive. None: no guess.
@@ -70,7 +71,7 @@ class Rig:
     step: float
     interpolation: str = "zero_order"
     delay: float = 0
-    input: Channel = field(default_factory=Channel)
+    input: Channel | Mapping[str, Channel] = field(default_factory=Channel)
     output: Channel = field(default_factory=Channel)
     guess: Mapping[str, tuple[float, float]] | None = None
 
@@ -83,35 +84,54 @@ class Rig:
             check_choice("interpolation (for a fractional delay)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS)
         else:
             check_integer(f"delay (for {self.interpolation})", self.delay, MAX_DELAY, least)
-        for name, other in (("input", "range"), ("output", "limit")):
-            channel = getattr(self, name)
-            right = "limit" if other == "range" else "range"
-            given = channel.get(other) if isinstance(channel, Mapping) else getattr(channel, other, None)
-            if given is not None:
-                raise ValueError(f"{name} must have no {other}, but has {short_repr(given)}; use {right}")
-            if isinstance(channel, Mapping):
-                channel = _from_mapping(Channel, channel, name)
-                object.__setattr__(self, name, channel)
-            if not isinstance(channel, Channel):
-                raise ValueError(f"{name} must be a Channel, but is {channel!r:.60}; use Channel('N', limit=20)")
-        if self.output.lag is not None:
-            raise ValueError(f"output must have no lag, but has {self.output.lag}; a lag is of the input")
-        if self.input.lag is not None:
-            check_choice(
-                "interpolation (for an input with a lag)", self.interpolation, FRACTIONAL_DELAY_INTERPOLATIONS[:2]
-            )
-        if self.input.kind != "displacement":
-            raise ValueError(f"input must have no kind, but has {self.input.kind!r}; kind is of the output")
-        if (kind := sensor_kind_of_unit(self.output.unit)) not in (None, self.output.kind):
-            raise ValueError(
-                f"output.kind must be {kind!r} with the unit {self.output.unit}, but is {self.output.kind!r}; mend one"
-            )
+        object.__setattr__(self, "input", checked_inputs(self.input, self.interpolation))
+        object.__setattr__(self, "output", checked_output(self.output))
         object.__setattr__(self, "guess", _check_guess(self.guess))
+        if self.guess is not None and len(self.inputs) > 1:
+            raise ValueError(f"guess must be left out with several inputs, {list(self.inputs)}; it is of one mass")
 
     @property
     def inputs(self) -> dict[str, Channel]:
-        """The input channels, by the names of the model's inputs: a rig has one, ``u``."""
-        return {"u": self.input}
+        """The input channels by the names of the model's inputs; one that has no name is ``u``."""
+        return {"u": self.input} if isinstance(self.input, Channel) else dict(self.input)
+
+    @property
+    def only_input(self) -> Channel:
+        """The channel of the only input.
+
+        Raises:
+            ValueError: for several inputs.
+        """
+        if len(self.inputs) > 1:
+            raise ValueError(
+                f"rig must have one input here, but has {list(self.inputs)}; OnlineEstimator and "
+                f"maximum_a_posteriori take several"
+            )
+        return next(iter(self.inputs.values()))
+
+    def check_inputs_of(self, model: Model) -> None:
+        """Refuse a model with other inputs. One channel without a name is of any model with one input or none.
+
+        Raises:
+            ValueError: naming the inputs.
+        """
+        if isinstance(self.input, Channel) and model.n_inputs <= 1:
+            return
+        if isinstance(self.input, Channel) or list(self.input) != list(model.inputs):
+            channels = ", ".join(f"{name!r}: Channel(...)" for name in model.inputs)
+            raise ValueError(
+                f"rig.input must have a channel for each input of {model.name!r}, in its order {list(model.inputs)}, "
+                f"but has {list(self.inputs)}; write input={{{channels}}}"
+            )
+
+    @classmethod
+    def of_scales(cls, model: Model, scales: Scales) -> Rig:
+        """The rig in the units of a model's scales: a linear input, or a delay of 1 for a difference equation."""
+        units = scales.input_units(model.n_inputs)
+        by_name = {name: Channel(unit) for name, unit in zip(model.inputs, units, strict=True)}
+        inputs = Channel(scales.input_unit) if len(by_name) <= 1 else by_name
+        timing: tuple[str, int] = ("linear", 0) if model.is_continuous else ("zero_order", 1)
+        return cls(scales.step, *timing, inputs, Channel(scales.output_unit))
 
     @classmethod
     def silverbox(cls, interpolation: str = "spline", delay: int = 0) -> Rig:
@@ -140,13 +160,17 @@ class Rig:
         Raises:
             ValueError: naming the key, for an unknown or missing key, or a value out of its range.
         """
-        return _from_mapping(cls, mapping, "rig")
+        check_keys(cls, mapping, "rig")
+        if "step" not in mapping:
+            raise ValueError("rig must have a step, but has none; give the seconds between samples")
+        return cls(**mapping)
 
     @classmethod
     def from_file(cls, path: str | Path) -> Rig:
         """Read a TOML rig file: ``step``, ``interpolation``, ``delay``, tables ``input``, ``output`` and ``guess``.
 
-        A table ``instrument`` holds settings of the plant (`read_with_instrument`).
+        Several inputs have a table each by their names, ``input.left`` and ``input.right``. A table ``instrument``
+        holds settings of the plant (`read_with_instrument`).
 
         Raises:
             ValueError: naming the file and the fault.
@@ -219,7 +243,8 @@ class Rig:
         Args:
             provenance: source of the numbers, for the first line, such as ``", from record.csv"``.
         """
-        units = {name: self.scales.unit(self.model.dimensions[name]) for name in _GUESSED_PARAMETERS}
+        scales, dimensions = self.scales, duffing(offsets=True).dimensions
+        units = {name: scales.unit(dimensions[name]) for name in _GUESSED_PARAMETERS if len(self.inputs) == 1}
         return rig_file_text(
             self.step, self.interpolation, self.delay, self.input, self.output, self.guess, units, provenance
         )
@@ -228,9 +253,7 @@ class Rig:
         """The rig as nested dictionaries for JSON and TOML, without unknown values."""
         mapping: dict[str, Any] = asdict(self)
         mapping["guess"] = None if self.guess is None else {name: list(ends) for name, ends in self.guess.items()}
-        for name in ("input", "output"):
-            mapping[name] = {key: value for key, value in mapping[name].items() if value is not None}
-        return {key: value for key, value in mapping.items() if value is not None}
+        return {key: _without_none(value) for key, value in mapping.items() if value is not None}
 
     @property
     def integer_delay(self) -> int:
@@ -239,22 +262,32 @@ class Rig:
         Raises:
             ValueError: for a fractional delay, or a lag of the input, which `identify` alone takes.
         """
-        if self.input.lag is not None:
-            raise ValueError(f"input must have no lag, except for identify, but has {self.input.lag} s; leave it out")
+        for channel in self.inputs.values():
+            if channel.lag is not None:
+                raise ValueError(f"input must have no lag, except for identify, but has {channel.lag} s; leave it out")
         if self.delay != int(self.delay):
             raise ValueError(f"delay must be an integer, except for identify, but is {self.delay}; round it")
         return int(self.delay)
 
     @property
     def scales(self) -> Scales:
-        """The scales: the input's limit and the output's range, 1 where unknown, with step and units."""
+        """The scales: the inputs' limits and the output's range, 1 where unknown, with step and units."""
         order = DERIVATIVE_ORDER_OF_SENSOR[self.output.kind]
-        units = self.input.unit, self.output.unit
-        return Scales(float(self.step), self.input.limit or 1.0, self.output.range or 1.0, order, *units)
+        (limit, unit), *others = ((one.limit or 1.0, one.unit) for one in self.inputs.values())
+        return Scales(
+            float(self.step), limit, self.output.range or 1.0, order, unit, self.output.unit,
+            tuple(limit for limit, _ in others), tuple(unit for _, unit in others),
+        )  # fmt: skip
 
     @property
     def model(self) -> Model:
-        """Eq. (1) with offsets, and with the output of the rig's sensor."""
+        """Eq. (1) with offsets, and with the output of the rig's sensor.
+
+        Raises:
+            ValueError: for several inputs.
+        """
+        if len(self.inputs) > 1:
+            raise ValueError(f"model must be given for a rig with several inputs, {list(self.inputs)}; make a Model")
         return duffing(offsets=True, sensor=self.output.kind)
 
 
@@ -289,20 +322,8 @@ def _check_guess(guess: object) -> dict[str, tuple[float, float]] | None:
     return checked
 
 
-def _from_mapping(cls: Any, mapping: object, label: str) -> Any:
-    """A `Rig` or `Channel` from a dictionary of its arguments; ``label`` names it in messages."""
-    if not isinstance(mapping, Mapping):
-        raise ValueError(f"{label} must be a table of names and values, but is {mapping!r:.60}")
-    known = [one.name for one in fields(cls)]
-    for key in mapping:
-        if key not in known:
-            raise ValueError(f"{label} must have keys of {known}, but has {key!r:.60}{did_you_mean(key, known)}")
-    if cls is Rig and "step" not in mapping:
-        raise ValueError("rig must have a step, but has none; give the seconds between samples")
-    if cls is Rig:
-        return cls(**mapping)
-    try:
-        return cls(**mapping)
-    except ValueError as error:  # its message begins with the name of a key
-        key, _, rest = str(error).partition(" ")
-        raise ValueError(f"{label}.{key} {rest.removeprefix(f'of an {label} ')}") from error
+def _without_none(value: Any) -> Any:
+    """A value of `Rig.to_dict` without unknown values, however deep."""
+    if not isinstance(value, dict):
+        return value
+    return {key: _without_none(inner) for key, inner in value.items() if inner is not None}

@@ -53,7 +53,7 @@ def rig_prior(rig: Rig, scales: Scales | None = None) -> Belief:
         raise ValueError("rig must have a guess of m, c, a and b, but has none; add one, or use identify on a record")
     scales = rig.scales if scales is None else scales
     axes = {name: _quadrature_axis(name, *rig.guess[name]) for name in rig.guess}
-    axes["u0"] = gauss_hermite(rig.input.offset, OFFSET_STD_FRACTION * scales.input, _OFFSET_NODES)
+    axes["u0"] = gauss_hermite(rig.only_input.offset, OFFSET_STD_FRACTION * scales.input, _OFFSET_NODES)
     axes["y0"] = gauss_hermite(rig.output.offset, OFFSET_STD_FRACTION * scales.output, _OFFSET_NODES)
     return belief_from_moments(rig, scales, *quadrature_moments(rig.model, axes, scales))
 
@@ -64,7 +64,7 @@ def belief_from_moments(rig: Rig, scales: Scales, mean: FloatArray, cov: FloatAr
     joint_mean, joint = _with_unknown_state(model, DERIVATIVE_ORDER_OF_SENSOR[rig.output.kind], mean, cov)
     force, sensor = (
         (channel.noise or NOISE_STD_FRACTION * scale) / scale
-        for channel, scale in ((rig.input, scales.input), (rig.output, scales.output))
+        for channel, scale in ((rig.only_input, scales.input), (rig.output, scales.output))
     )
     gamma, xi = ((2.0, 2.0 * float(noise) ** 2) for noise in (coefficients["gain"] * force / np.sqrt(3), sensor))
     return Belief.of(model, joint_mean, joint, gamma, xi, scales=scales)

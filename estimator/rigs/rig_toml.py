@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from itertools import chain
 
 from estimator.rigs.channel import Channel
 
@@ -23,7 +24,7 @@ def rig_file_text(
     step: float,
     interpolation: str,
     delay: float,
-    input_channel: Channel,
+    inputs: Channel | Mapping[str, Channel],
     output_channel: Channel,
     guess: Mapping[str, tuple[float, float]] | None,
     units_of_guess: Mapping[str, str],
@@ -35,31 +36,23 @@ def rig_file_text(
         step: sampling step [s].
         interpolation: of the input.
         delay: of the input [samples].
-        input_channel: the input.
+        inputs: the input, or several by name.
         output_channel: the output.
         guess: parameter to its 90 % interval, or None.
-        units_of_guess: parameter to its unit.
+        units_of_guess: parameter to its unit; empty for a rig that has no guess.
         provenance: source of the numbers, for the first line, such as ``", from record.csv"``.
     """
+    tables = {"input": inputs} if isinstance(inputs, Channel) else {f"input.{i}": one for i, one in inputs.items()}
     lines = [
         f"# A rig{provenance}. Read by: duffing-env identify, and Rig.from_file.",
-        _EQUATION_COMMENT.format(output=_SYMBOL_OF_KIND[output_channel.kind]),
+        *([_EQUATION_COMMENT.format(output=_SYMBOL_OF_KIND[output_channel.kind])] if units_of_guess else []),
         "",
         f"step = {float(step)!r}  # s between samples",
         _INTERPOLATION_COMMENT,
         f"interpolation = {_quote(interpolation)}",
         f"delay = {delay:.12g}  # samples, of the input",
         "",
-        "[input]",
-        f"unit = {_quote(input_channel.unit)}{_UNIT_COMMENT if input_channel.unit == '1' else ''}",
-        *_column_lines(input_channel),
-        _value_or_placeholder("limit", input_channel.limit, "never exceeded, in either direction"),
-        *_optional_lines(
-            "lag", input_channel.lag, "s, time constant of a first-order lag between the recorded and the acting input"
-        ),
-        *_optional_lines("noise", input_channel.noise, "standard deviation of the disturbance of the force"),
-        *_optional_lines("offset", input_channel.offset or None, "u0, a guess"),
-        "",
+        *chain.from_iterable(_input_lines(*titled) for titled in tables.items()),
         "[output]",
         f"unit = {_quote(output_channel.unit)}{_UNIT_COMMENT if output_channel.unit == '1' else ''}",
         *_column_lines(output_channel),
@@ -68,16 +61,35 @@ def rig_file_text(
         _value_or_placeholder("range", output_channel.range, "an experiment stops outside of it, in either direction"),
         _value_or_placeholder("noise", output_channel.noise, "standard deviation of the sensor's noise, if known"),
         *_optional_lines("offset", output_channel.offset or None, "y0, a guess"),
-        "",
-        "# Your guess: the ends of an interval that holds each parameter with a probability of 90 %.",
-        "# identify does not need it.",
     ]
-    if guess is None:
+    if units_of_guess:
+        lines += [
+            "",
+            "# Your guess: the ends of an interval that holds each parameter with a probability of 90 %.",
+            "# identify does not need it.",
+        ]
+    if guess is None and units_of_guess:
         lines += ["# [guess]", *(f"# {name} = [low, high]  # {unit}" for name, unit in units_of_guess.items())]
-    else:
+    elif guess is not None:
         lines.append("[guess]")
         lines += [f"{name} = [{low!r}, {high!r}]  # {units_of_guess[name]}" for name, (low, high) in guess.items()]
     return "\n".join([*lines, ""])
+
+
+def _input_lines(title: str, channel: Channel) -> list[str]:
+    """The table of an input, with an empty line after it."""
+    return [
+        f"[{title}]",
+        f"unit = {_quote(channel.unit)}{_UNIT_COMMENT if channel.unit == '1' else ''}",
+        *_column_lines(channel),
+        _value_or_placeholder("limit", channel.limit, "never exceeded, in either direction"),
+        *_optional_lines(
+            "lag", channel.lag, "s, time constant of a first-order lag between the recorded and the acting input"
+        ),
+        *_optional_lines("noise", channel.noise, "standard deviation of the disturbance of the force"),
+        *_optional_lines("offset", channel.offset or None, "u0, a guess"),
+        "",
+    ]
 
 
 def _column_lines(channel: Channel) -> list[str]:

@@ -39,7 +39,7 @@ def model_near_one(
     Raises:
         ValueError: as `estimator.models.scaling.state_sizes`, or for a missing parameter.
     """
-    channels = dict.fromkeys(model.inputs, scales.input) | dict.fromkeys(model.outputs, scales.output)
+    channels = _channel_sizes(model, scales)
     of_states = state_sizes(Model.require_model(model), scales.step, channel_sizes or channels, sizes)
     first = scale_model(model, scales.step, channels | of_states)
     typical = np.abs(coefficients_of(first, mean, scales))
@@ -101,7 +101,7 @@ def prior_in_units(
     scales = rig.scales
     scaled = model_near_one(model, scales, mean, sizes=sizes)
     moments = gaussian_moments(scaled, mean, std, scales)
-    channels = dict.fromkeys(model.inputs, scales.input) | dict.fromkeys(model.outputs, scales.output)
+    channels = _channel_sizes(model, scales)
     found = state_sizes(model, scales.step, channels, sizes)
     check_mapping("state_std", state_std or {})
     unknown = sorted(set(state_std or {}) - set(found))
@@ -111,3 +111,9 @@ def prior_in_units(
     sensors: npt.NDArray[np.float64] = to_float_array("measurement_noise", measurement_noise) / scales.output
     noises = process_noise / scales.output, sensors.tolist()
     return weak_prior(scaled, *moments, *noises, noise_shape, states, scales)
+
+
+def _channel_sizes(model: Model, scales: Scales) -> dict[str, float]:
+    """Input or sensor to the size of its numbers, in its unit."""
+    of_inputs = zip(model.inputs, scales.input_scales(model.n_inputs).tolist(), strict=True)
+    return dict(of_inputs) | dict.fromkeys(model.outputs, scales.output)

@@ -10,10 +10,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import TypeVar
+
+import numpy as np
 
 from estimator.rigs.silverbox_constants import SILVERBOX_SAMPLING_STEP
 from estimator.support.argument_checks import check_number
+from estimator.support.array_types import FloatArray
+
+#: A number or a unit.
+_T = TypeVar("_T")
 
 #: Powers of the input's unit, the displacement's unit and the second.
 UnitPowers = tuple[int, int, int]
@@ -105,6 +112,8 @@ class Scales:
         order: order of the time derivative of the displacement that the sensor measures: 0, 1 or 2.
         input_unit: unit of the input, such as ``"N"``.
         output_unit: unit of the output, such as ``"m"``, or ``"m/s"`` for a velocity.
+        more_inputs: scales of the inputs after the first, in their units; empty where all inputs have the first one's.
+        more_input_units: units of the inputs after the first, likewise.
 
     Example:
         >>> from estimator.rigs.units import Scales
@@ -119,11 +128,37 @@ class Scales:
     order: int = 0
     input_unit: str = "V"
     output_unit: str = "V"
+    more_inputs: tuple[float, ...] = ()
+    more_input_units: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("more_inputs", "more_input_units"):  # lists come from JSON
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for i, scale in enumerate(self.more_inputs):
+            check_number(f"more_inputs[{i}]", scale, *MAGNITUDE_BOUNDS)
         check_number("step", self.step, *MAGNITUDE_BOUNDS, "give the seconds between samples")
         for name in ("input", "output"):
             check_number(name, getattr(self, name), *MAGNITUDE_BOUNDS)
+
+    def input_scales(self, count: int) -> FloatArray:
+        """(count,) scales of a model's inputs, in their units.
+
+        Raises:
+            ValueError: for another number of inputs than ``more_inputs`` has.
+        """
+        return np.array(_of_all(count, self.input, self.more_inputs), dtype=np.float64)
+
+    def input_units(self, count: int) -> tuple[str, ...]:
+        """(count,) units of a model's inputs.
+
+        Raises:
+            ValueError: for another number of inputs than ``more_input_units`` has.
+        """
+        return _of_all(count, self.input_unit, self.more_input_units)
+
+    def to_dict(self) -> dict[str, object]:
+        """The scales for JSON; ``Scales(**d)`` makes the same scales again."""
+        return {name: value for name, value in asdict(self).items() if value != ()}
 
     @property
     def displacement(self) -> float:
@@ -155,6 +190,14 @@ class Scales:
 
 #: Scales of the Silverbox: input and output in volts, unscaled.
 VOLT_SCALES = Scales()
+
+
+def _of_all(count: int, first: _T, others: tuple[_T, ...]) -> tuple[_T, ...]:
+    """The first input's value and the others', or the first one's for all."""
+    found = (first, *others) if others else (first,) * count
+    if count and len(found) != count:
+        raise ValueError(f"scales must be of {count} inputs, but are of {len(found)}; give more_inputs {count - 1}")
+    return found[:count]
 
 
 def _parse_unit(unit: str) -> dict[str, int]:

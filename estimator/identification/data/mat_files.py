@@ -47,7 +47,7 @@ def read_mat_records(path: Path, rig: Rig) -> list[Record]:
         ValueError: naming the file and the fault.
         ModuleNotFoundError: for a file of version 7.3 without h5py.
     """
-    names = (rig.input.column or "u", rig.output.column or "y")
+    names = (rig.only_input.column or "u", rig.output.column or "y")
     with path.open("rb") as file:
         if file.read(10) == b"MATLAB 7.3":
             require_packages("h5py")
@@ -73,7 +73,7 @@ def read_mat_records(path: Path, rig: Rig) -> list[Record]:
             f"{path} must hold the variables {names[0]} and {names[1]}, but lacks {' and '.join(sorted(lacking))}; "
             f"mend the names, there or as column = '...' in the rig's [input] and [output]"
         )
-    columns = ColumnNames(*names, "request" if rig.input.column and rig.output.column else "name")
+    columns = ColumnNames(*names, "request" if rig.only_input.column and rig.output.column else "name")
     u, y = (np.asarray(held[name]) for name in names)
     if u.ndim <= 1 and y.ndim <= 1:
         first, second = (to_finite_series(f"{name} of {path}", held[name], allow_nan=True) for name in names)

@@ -37,8 +37,8 @@ def read_record_file(path: str | Path, rig: Rig) -> list[Record]:
 
 
 def _read_text(path: Path, rig: Rig) -> Record:
-    table = read_table(path, rig.input.column, rig.output.column)
+    table = read_table(path, rig.only_input.column, rig.output.column)
     record = mask_over_range(
-        str(path), *table.signals_in_rig_units(rig.input, rig.output), table.times(rig.step), rig.step
+        str(path), *table.signals_in_rig_units(rig.only_input, rig.output), table.times(rig.step), rig.step
     )
     return replace(record, step=table.step(), columns=table.column_names())

@@ -122,7 +122,7 @@ def disturbance_message(channel: Channel, input_rms: float, disturbance_std: flo
 
 def check_process_noise(problem: ScaledRecords, disturbance: tuple[float, float]) -> list[CheckFinding]:
     """A finding where the disturbance of the force, (mean, standard deviation), is surely larger than usual."""
-    channel, input_rms, (mean, std) = problem.rig.input, problem.input_rms * problem.scales.input, disturbance
+    channel, input_rms, (mean, std) = problem.rig.only_input, problem.input_rms * problem.scales.input, disturbance
     # A disturbance that the sensor's noise hides has a wide interval, whose lower end is small.
     if not disturbance_message(channel, input_rms, mean - _STDS_FOR_95_PERCENT * std):
         return []
@@ -153,7 +153,7 @@ def check_asymmetry(problem: ScaledRecords, belief: Belief) -> list[CheckFinding
 
 def check_input_lag(problem: ScaledRecords, parameters: Mapping[str, tuple[float, float]]) -> list[CheckFinding]:
     """A finding where a lag of the input leaves the mass uncertain: a coil's damping lags as its force does."""
-    lag, (m, std), (c, _) = problem.rig.input.lag, parameters["m"], parameters["c"]
+    lag, (m, std), (c, _) = problem.rig.only_input.lag, parameters["m"], parameters["c"]
     if lag is None or abs(c) * lag < std:
         return []
     message = (

@@ -53,7 +53,7 @@ def check_records(problem: ScaledRecords, records: Sequence[Record]) -> list[Che
     warnings += _check_stale_outputs(records)
     largest_input = max(np.abs(one.u).max() for one in records)
     largest_output = max(np.nanmax(np.abs(one.y)) for one in records)
-    source, sink = rig.input, rig.output
+    source, sink = rig.only_input, rig.output
     if source.limit and largest_input > source.limit * (1 + 1e-6):
         message = (
             f"inputs of {largest_input:.3g} {source.unit} exceed the rig's limit of {source.limit:g} {source.unit}"

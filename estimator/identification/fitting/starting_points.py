@@ -64,7 +64,7 @@ def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
     candidates = weak_form_starts(problem.with_segments(problem.most_driven_segments(samples), samples))
     if problem.rig.guess is not None:
         middle = {name: (low + high) / 2 for name, (low, high) in problem.rig.guess.items()}
-        middle |= {"u0": problem.rig.input.offset, "y0": problem.rig.output.offset}
+        middle |= {"u0": problem.rig.only_input.offset, "y0": problem.rig.output.offset}
         guessed = coefficients_of(problem.model, middle, problem.scales)
         candidates.append(problem.moments_about_origin(guessed, np.zeros((len(guessed),) * 2))[0])
     if not candidates:

@@ -122,7 +122,7 @@ class ScaledRecords:
     @property
     def lag(self) -> float:
         """Time constant of the input's lag that the rig states, in sampling steps."""
-        return (self.rig.input.lag or 0.0) / self.rig.step
+        return (self.rig.only_input.lag or 0.0) / self.rig.step
 
     def noises_of_records(self, noises: FloatArray) -> FloatArray:
         """(n · records, 2) noise variances of every record, record by record, from the overall variances (n, 2)."""
