@@ -11,14 +11,13 @@ import numpy.typing as npt
 from estimator.belief import Belief
 from estimator.inference.filter import Filter
 from estimator.inference.noise_grid import NoiseGridSize, NoiseRatio
+from estimator.inference.record_arrays import finite_channels, sample_of_channels
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
 from estimator.priors import recorded_prior, silverbox_prior
-from estimator.rigs.channel import Channel
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import rig_prior
 from estimator.settings import EstimatorSettings, checked_settings
-from estimator.support.argument_checks import to_finite_series, to_scalar
 from estimator.support.array_types import FloatArray
 from estimator.support.progress import show_progress
 from estimator.support.update_options import DEFAULT_ITERATIONS
@@ -114,14 +113,16 @@ class OnlineEstimator:
         self._spare_buffers = np.empty_like(self._free_energies), np.empty((1, self.model.n_outputs, 2))
         prior = _checked_prior(self.model, prior, self.settings)
         if rig is None:
-            units = Channel(prior.scales.input_unit), Channel(prior.scales.output_unit)
-            rig = Rig(prior.step, *(("linear", 0) if self.model.is_continuous else ("zero_order", 1)), *units)
+            rig = Rig.of_scales(self.model, prior.scales)
+        rig.check_inputs_of(self.model)
         if rig.step != prior.step:
             raise ValueError(
                 f"rig.step must be the prior's, {prior.step}, but is {rig.step}; make the prior with "
                 "scales=rig.scales, or give the rig the prior's step"
             )
         self.rig, self.scales = rig, prior.scales
+        self._input_scales = prior.scales.input_scales(self.model.n_inputs)
+        self._is_scalar = self.model.n_inputs == self.model.n_outputs == 1
         self._filter = Filter(prior, rig, self.settings)
 
     @property
@@ -163,23 +164,25 @@ class OnlineEstimator:
         """Number of samples that wait for a later input: 1 if the rig looks ahead, else 0."""
         return int(self._filter.input_stencil.lookahead)
 
-    def update(self, u: float, y: float | npt.ArrayLike) -> None:
-        """Update the posterior with the sample (u, y); y has a number for each sensor.
+    def update(self, u: float | npt.ArrayLike | None, y: float | npt.ArrayLike) -> None:
+        """Update the posterior with the sample (u, y).
+
+        Args:
+            u: the input, or (inputs,) several in the model's order; None for a model without inputs.
+            y: the output, or (sensors,) several.
 
         Raises:
             ValueError: if u or y is not a finite number, or the belief overflows. The estimator is then unchanged.
         """
         if self._filter.input_stencil.needs_whole_record:
             raise ValueError("interpolation must not be 'spline' for single samples; use run() or 'look_ahead'")
-        if self.model.n_outputs > 1:
-            self.run(np.array([to_scalar("u", u)]), np.reshape(to_finite_series("y", y), (1, -1)))
+        if not self._is_scalar:
+            inputs = sample_of_channels("u", u, self.model.n_inputs)
+            self.run(inputs, sample_of_channels("y", y, self.model.n_outputs))
             return
         # Two finite floats need no further check: this is the inner loop of a user with single samples.
         if not (isinstance(u, float) and isinstance(y, float) and math.isfinite(u + y)):
-            u, y = (
-                float(to_finite_series("u", [to_scalar("u", u)])[0]),
-                float(to_finite_series("y", [to_scalar("y", y)])[0]),
-            )
+            u, y = (float(sample_of_channels(name, value, 1)[0]) for name, value in (("u", u), ("y", y)))
         u, y = u / self.scales.input, y / self.scales.output
         used = not self._filter.is_waiting
         free_energies, forecasts = self._spare_buffers
@@ -194,11 +197,13 @@ class OnlineEstimator:
             fits = len(previous[0]) == 1 and len(previous[1]) == 1
             self._spare_buffers = previous if fits else (np.empty_like(free_energies), np.empty_like(forecasts))
 
-    def run(self, u: npt.ArrayLike, y: npt.ArrayLike, progress: bool = False, missing: bool = False) -> FloatArray:
+    def run(
+        self, u: npt.ArrayLike | None, y: npt.ArrayLike, progress: bool = False, missing: bool = False
+    ) -> FloatArray:
         """Update the posterior with T samples, in order, as `update` does with each.
 
         Args:
-            u: (T,) inputs.
+            u: (T,) inputs; (T, inputs) of several, in the model's order; (T, 0) or None for a model without inputs.
             y: (T,) outputs, paired with u by index; (T, sensors) of several sensors.
             progress: show the progress on stderr, if it takes more than 5 seconds.
             missing: outputs that are NaN are missing: the state is predicted, and nothing is updated.
@@ -224,7 +229,7 @@ class OnlineEstimator:
             if overflowed_at >= 0:
                 place = start + overflowed_at
                 output = (outputs[place] * self.scales.output).tolist()
-                raise ValueError(_overflow_message(place, u[place] * self.scales.input, output))
+                raise ValueError(_overflow_message(place, (u[place] * self._input_scales).tolist(), output))
             used += new
         self._filter = memory
         self._forecasts = forecasts[:used]
@@ -248,11 +253,11 @@ class OnlineEstimator:
         """
         self._filter.restore(arrays)
 
-    def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+    def predict(self, u: npt.ArrayLike | None, y: npt.ArrayLike) -> FloatArray:
         """One-step predictions with the coefficients and noises fixed at their means.
 
         Args:
-            u: (T,) inputs.
+            u: the inputs, as `run` takes them.
             y: (T,) or (T, sensors) outputs, paired with u by index; T >= 2.
 
         Returns:
@@ -262,11 +267,11 @@ class OnlineEstimator:
         u, outputs = self._checked_record(u, y, False, min_length=2)
         return self._in_rig_units(self._filter.predict(u, outputs), self.scales.output)
 
-    def forecast(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+    def forecast(self, u: npt.ArrayLike | None, y: npt.ArrayLike) -> FloatArray:
         """Predictive mean and variance of each output, with the coefficients and noises fixed at their means.
 
         Args:
-            u: (T,) inputs.
+            u: the inputs, as `run` takes them.
             y: (T,) or (T, sensors) outputs, paired with u by index; NaN where one is missing.
 
         Returns:
@@ -281,39 +286,32 @@ class OnlineEstimator:
         """Free run with the coefficients fixed at their means, over all of u.
 
         Args:
-            u: (T,) inputs.
+            u: (T,) inputs; (T, inputs) of several; (T, 0) for a model without inputs.
             y_init: 2 to T first outputs. The run starts from the last two in the paper's model, else from a filter.
 
         Returns:
             Simulated outputs (T,) or (T, sensors); inf or NaN after the model diverges.
         """
-        u = to_finite_series("u", u) / self.scales.input
-        outputs = self._checked_outputs("y_init", y_init, False)
+        u = finite_channels("u", u, self.model.n_inputs, "input") / self._input_scales
+        outputs = finite_channels("y_init", y_init, self.model.n_outputs, "sensor") / self.scales.output
         if not 2 <= len(outputs) <= len(u):
             raise ValueError(f"y_init must hold between 2 and len(u) = {len(u)} outputs, but holds {len(outputs)}")
         return self._in_rig_units(self._filter.simulate(u, outputs), self.scales.output)
 
     def _checked_record(
-        self, u: npt.ArrayLike, y: npt.ArrayLike, missing: bool, min_length: int = 0
+        self, u: npt.ArrayLike | None, y: npt.ArrayLike, missing: bool, min_length: int = 0
     ) -> tuple[FloatArray, FloatArray]:
-        """Inputs (T,) and outputs (T, sensors), checked."""
-        inputs, outputs = to_finite_series("u", u), self._checked_outputs("y", y, missing)
+        """Inputs (T, inputs) and outputs (T, sensors), checked."""
+        if u is None and not self.model.inputs:
+            u = np.empty((*np.shape(y)[:1], 0))
+        inputs = finite_channels("u", u, self.model.n_inputs, "input")
+        outputs = finite_channels("y", y, self.model.n_outputs, "sensor", missing)
         if len(inputs) != len(outputs) or len(inputs) < min_length:
             minimum = f" of at least {min_length}" if min_length else ""
             raise ValueError(
                 f"u and y must have one length{minimum}, but have {len(inputs)} and {len(outputs)}; cut the longer one"
             )
-        return inputs / self.scales.input, outputs
-
-    def _checked_outputs(self, name: str, y: npt.ArrayLike, missing: bool) -> FloatArray:
-        sensors = self.model.n_outputs
-        if sensors == 1:
-            return to_finite_series(name, y, missing)[:, None] / self.scales.output
-        shape = np.shape(y)
-        if len(shape) != 2 or shape[1] != sensors:
-            raise ValueError(f"{name} must have shape (T, {sensors}), a column for each sensor, but has {shape}")
-        flat = np.ma.reshape(y, -1) if isinstance(y, np.ma.MaskedArray) else np.reshape(y, -1)
-        return to_finite_series(name, flat, missing).reshape(shape) / self.scales.output
+        return inputs / self._input_scales, outputs / self.scales.output
 
     def _in_rig_units(self, values: FloatArray, *scales: float) -> FloatArray:
         """Results of the filter (T, sensors, ...) in the rig's units; (T, ...) of one sensor."""
@@ -330,7 +328,7 @@ class OnlineEstimator:
                 yield start, min(start + _SAMPLES_BETWEEN_REPORTS, samples)
 
 
-def _overflow_message(place: int, u: float, y: object) -> str:
+def _overflow_message(place: int, u: object, y: object) -> str:
     return (
         f"u and y must keep the belief finite, but near sample {place} (u = {u}, y = {y}) it overflowed; check the "
         f"sample's scale, or use a prior nearer to the system (the estimator is unchanged)"

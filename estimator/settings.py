@@ -9,7 +9,6 @@ from typing import Any
 from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.difference_equation import difference
 from estimator.models.model import Model
-from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import check_bool, check_choice, check_integer, check_number
 from estimator.support.update_options import DEFAULT_ITERATIONS, EXPECTATIONS, MAX_ITERATIONS
 
@@ -38,7 +37,6 @@ def checked_settings(model: Model, settings: EstimatorSettings) -> EstimatorSett
     Raises:
         ValueError: naming the option, the value and the remedy.
     """
-    check_single_input("OnlineEstimator", model, "estimate in an environment of it, and name at least one input")
     check_choice("factorisation", settings.factorisation, DEFAULT_ITERATIONS)
     check_bool("as_published", settings.as_published)
     is_mean_field = settings.factorisation == "mean_field"

@@ -45,6 +45,14 @@ def compile_input_writer(model: Model, degree: int, input_rows: Sequence[int], l
         for row, place in zip(known_inputs(model, degree), input_rows, strict=True)
     )
 
+    if not rows:  # Numba has no loop over an empty tuple
+
+        @jit_closure("none")
+        def feed_nothing(W, j, i, now, last, older):
+            return None
+
+        return feed_nothing
+
     @jit_closure("_".join(map(str, chain(*rows, (lanes,)))))
     def feed(W, j, i, now, last, older):
         values = (now, last, older)

@@ -17,10 +17,9 @@ from estimator.engine import kernels
 from estimator.engine.storage_layout import belief_rows, first_input_row
 from estimator.inference import mean_field
 from estimator.inference.input_interpolation import input_stencil, record_lengths, rig_input_degree
-from estimator.inference.record_filter import outputs_by_sensor
+from estimator.inference.record_arrays import inputs_by_channel, outputs_by_sensor
 from estimator.models.model import Model
 from estimator.rigs.rig import Rig
-from estimator.support.argument_checks import to_float_array
 from estimator.support.update_options import DEFAULT_ITERATIONS
 
 
@@ -28,7 +27,8 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     """Identify a system from each of n records, sample by sample.
 
     Args:
-        u: (n, T) inputs. A record ends before its first NaN, so that episodes of different lengths fit into one array.
+        u: (n, T) inputs, or (n, T, inputs) of several or none. A record ends before its first NaN, in the outputs of a
+            model without inputs, so that episodes of different lengths fit into one array.
         y: (n, T) outputs, paired with u by index as the rig says; (n, T, sensors) of several sensors.
         prior: `Belief` before the first sample of every record; the updates use its factorisation.
         rig: timing and interpolation of the inputs. None is the timing of an environment: the t-th input of a
@@ -44,10 +44,10 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
     """
     if not isinstance(prior, Belief):
         raise ValueError(f"prior must be a Belief, but is {prior!r:.60}; see estimator.priors")
-    inputs = to_float_array("u", u)
+    inputs = inputs_by_channel(prior.model, u)
     outputs = outputs_by_sensor(prior.model, inputs, y)
-    if inputs.ndim != 2:
-        raise ValueError(f"u must have shape (n, T), but has {inputs.shape}; pass u[None] for one record")
+    if inputs.ndim != 3:
+        raise ValueError(f"u must be of n records, but has shape {np.shape(u)}; pass u[None] for one")
     rig = Rig(prior.step, "linear") if rig is None else rig
     input_window = input_stencil(prior.model, rig)
     if input_window.repeats_first:
@@ -56,16 +56,17 @@ def posteriors(u: npt.ArrayLike, y: npt.ArrayLike, prior: Belief, rig: Rig | Non
         raise ValueError(
             f"delay must be 0 or more for a difference equation, but is {rig.delay}; shift u by a sample, or use run()"
         )
-    lengths = record_lengths(inputs)
+    lengths = record_lengths(inputs if prior.model.inputs else outputs)
     for row, length in enumerate(lengths):
         if not (np.isfinite(inputs[row, :length]).all() and np.isfinite(outputs[row, :length]).all()):
             raise ValueError(
                 f"u and y must be finite up to the end of a record, but in record {row} they are not; cut it before"
             )
-    inputs = np.concatenate([np.zeros((len(inputs), input_window.n_past)), inputs], axis=1)
+    flat_inputs = inputs.reshape(len(inputs), inputs.shape[1] * prior.model.n_inputs)
+    flat_inputs = np.concatenate([np.zeros((len(inputs), input_window.n_stored)), flat_inputs], axis=1)
     records = np.repeat(prior.record[None], len(inputs), axis=0)
     run = _compile_batch_filter(prior.model, rig_input_degree(prior.model, rig), prior.factorisation)
-    run(inputs, outputs, lengths, prior.record.copy(), input_window.stencil, records)
+    run(flat_inputs, outputs, lengths, prior.record.copy(), input_window.stencil, records)
     records.flags.writeable = False
     return prior.with_records(records)
 
@@ -82,7 +83,7 @@ def _compile_batch_filter(model: Model, degree: int, factorisation: str) -> Any:
         layout, update_all = dict(belief_update.layout), belief_update.update
     is_structured = factorisation == "structured"
     u_row, y_row = first_input_row(layout, model) * LANES, layout[f"Y_{next(iter(model.outputs))}"] * LANES
-    n_rows, size = len(layout), len(belief_rows(model))
+    n_rows, size, stride = len(layout), len(belief_rows(model)), model.n_inputs
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}_{factorisation}")
     def run(inputs, outputs, lengths, prior, stencil, records):
@@ -105,7 +106,7 @@ def _compile_batch_filter(model: Model, degree: int, factorisation: str) -> Any:
                     for i in range(rows):
                         value = 0.0
                         for w in range(window):
-                            value += inputs[first + j, t + w] * stencil[i, w] if is_active else 0.0
+                            value += inputs[first + j, t * stride + w] * stencil[i, w] if is_active else 0.0
                         W[u_row + i * LANES + j] = value
                     for k in range(outputs.shape[2]):
                         W[y_row + k * LANES + j] = outputs[first + j, t, k] if is_active else 0.0

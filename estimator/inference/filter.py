@@ -57,13 +57,13 @@ class Filter:
         self._block = np.zeros((blocks, len(self._loop.layout) * lanes))
         self._weights = self._initial_weights(records)
         self._begun = np.zeros(1)
-        self._inputs = np.zeros(self.input_stencil.n_past + 1)
+        self._inputs = np.zeros(self.input_stencil.n_stored + self.model.n_inputs)
         self._outputs = np.zeros((self.input_stencil.lookahead + 1, self.model.n_outputs))
         self._walk = settings.drift**2 * np.diag(prior.coefficients_cov)
         self._first = prior.record.copy()
         shape = [
             self.input_stencil.stride,
-            self.input_stencil.n_past,
+            self.input_stencil.n_stored,
             self.input_stencil.lookahead,
             self.input_stencil.repeats_first,
         ]
@@ -109,7 +109,7 @@ class Filter:
         return self.input_stencil.lookahead and not self._begun[0]
 
     def step(self, u: float, y: float, energies: FloatArray, forecasts: FloatArray) -> int:
-        """Update by one sample of one sensor; see `run`."""
+        """Update by one sample of one input and one sensor; see `run`."""
         self._inputs[-1] = u
         self._outputs[-1, 0] = y
         overflowed_at: int = self._loop.run(
@@ -122,7 +122,7 @@ class Filter:
         """Update by samples; a sample that waits for a later input is used by the next call.
 
         Args:
-            u: (T,) inputs.
+            u: (T, inputs) inputs.
             y: (T, sensors) outputs.
             energies: (T or more, iterations) receives the free energies, from the front; empty to skip all checks.
             forecasts: (T or more, sensors, 2) receives the predictive means and variances of the outputs.
@@ -130,17 +130,18 @@ class Filter:
         Returns:
             The sample at which the numbers overflowed, and then nothing has changed; or -1.
         """
-        at_once = self.input_stencil.needs_whole_record
-        inputs = (
-            self.input_stencil.spline_coefficients(u).reshape(-1) if at_once else np.concatenate([self._inputs[:-1], u])
-        )
+        stored = self.input_stencil.n_stored
+        if self.input_stencil.needs_whole_record:
+            inputs = self.input_stencil.spline_coefficients(u).reshape(-1)
+        else:
+            inputs = np.concatenate([self._inputs[:stored], u.reshape(-1)])
         outputs = np.concatenate([self._outputs[:-1], y])
         overflowed_at: int = self._loop.run(
             self._block, self._weights, self._begun, inputs, outputs,
             self.input_stencil.stencil, self._stencil_sizes, self._walk, energies, forecasts,
         )  # fmt: skip
         if overflowed_at < 0:
-            self._inputs[:-1] = inputs[: self.input_stencil.n_past]
+            self._inputs[:stored] = inputs[:stored]
             self._outputs[:-1] = outputs[: self.input_stencil.lookahead]
         return max(0, overflowed_at - int(self.input_stencil.lookahead)) if overflowed_at >= 0 else -1
 
@@ -211,7 +212,7 @@ class Filter:
             return self.with_known_parameters().forecast(u, y)[:, :, 0]
         t1, t2, t3, eta = self.belief.coefficients_mean
         predicted, last = y.copy(), y[1:-1, 0]
-        acting = np.concatenate([np.zeros(self.rig.integer_delay), u])[2 : len(y)]
+        acting = np.concatenate([np.zeros(self.rig.integer_delay), u[:, 0]])[2 : len(y)]
         predicted[2:, 0] = t1 * last + t2 * last**3 + t3 * y[:-2, 0] + eta * acting
         return predicted
 
@@ -223,7 +224,7 @@ class Filter:
         if self.is_paper_model:
             # The state is measured; the inputs that still act are the new ones and the delayed ones.
             kept = filter_at_mean.input_stencil.n_past
-            filter_at_mean._inputs[:-1] = np.concatenate([np.zeros(kept), u[:given]])[given:]
+            filter_at_mean._inputs[:-1] = np.concatenate([np.zeros(kept), u[:given, 0]])[given:]
             return (
                 np.concatenate([y_init, filter_at_mean.forecast(u[given:], unseen)[:, :, 0]])
                 if len(unseen)
@@ -270,7 +271,7 @@ class Filter:
             "weights": self._weights.copy(),
             "first": self._first.copy(),
             "walk": self._walk.copy(),
-            "inputs": self._inputs[:-1].copy(),
+            "inputs": self._inputs[: self.input_stencil.n_stored].copy(),
             "outputs": self._outputs[:-1].copy(),
             "begun": self._begun.copy(),
         }
@@ -305,7 +306,7 @@ class Filter:
             check_belief_record("records", self.model, record, _EIGENVALUE_TOLERANCE)
         for name in ("weights", "first", "walk", "begun"):
             setattr(self, f"_{name}", checked[name])
-        self._inputs[:-1], self._outputs[:-1] = checked["inputs"], checked["outputs"]
+        self._inputs[: self.input_stencil.n_stored], self._outputs[:-1] = checked["inputs"], checked["outputs"]
         self._write_records(checked["records"])
 
 

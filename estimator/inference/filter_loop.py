@@ -37,10 +37,11 @@ class FilterLoop:
             - W: (blocks, rows * lanes), the members' systems one after another.
             - weights: (members,) of the hypotheses.
             - begun: (1,) 0 before the first sample ever, then 1.
-            - inputs: the past inputs that still act, then the new ones; the former are shifted.
+            - inputs: (samples * inputs,) the past inputs that still act, then the new ones, sample after sample; the
+              former are shifted.
             - outputs: (samples, sensors), after the stored one; NaN where missing.
             - stencil: of `estimator.inference.input_interpolation.InputStencil`.
-            - steps: its stride, n_past, lookahead and repeats_first, as int64.
+            - steps: its stride, n_stored, lookahead and repeats_first, as int64.
             - walk: (K,) variances of the coefficients' random walk per sample.
             - energies: (samples, iterations) receives the free energies [nats]; empty to skip all checks.
             - forecasts: (samples, sensors, 2) receives the predictive mean and variance of each output.
@@ -176,7 +177,7 @@ def _compile_loop(
 
     @kernel(variant=variant)
     def run(W, weights, begun, inputs, outputs, stencil, steps, walk, energies, forecasts):
-        stride, n_past, lookahead, repeats_first = steps[0], steps[1], steps[2], steps[3]
+        stride, n_stored, lookahead, repeats_first = steps[0], steps[1], steps[2], steps[3]
         members, samples, iterations = len(weights), len(outputs) - lookahead, energies.shape[1]
         judged = energies.shape[0] > 0
         before, C = np.empty(scratch), np.zeros(shared_size)
@@ -187,8 +188,8 @@ def _compile_loop(
         _copy_beliefs(backup, W, record_length)
         first = 1 if lookahead and begun[0] == 0.0 else 0
         if repeats_first and begun[0] == 0.0:
-            for i in range(n_past):
-                inputs[i] = inputs[n_past]
+            for i in range(n_stored):
+                inputs[i] = inputs[n_stored + i % stride]
         overflowed_at = -1
         for t in range(first, samples):
             if is_shared:
@@ -220,11 +221,11 @@ def _compile_loop(
             _copy_beliefs(W, backup, record_length)
             copy(weights, 0, old_weights, members)
             if repeats_first and begun[0] == 0.0:
-                for i in range(n_past):
+                for i in range(n_stored):
                     inputs[i] = 0.0
             return overflowed_at
-        for i in range(n_past):
-            inputs[i] = inputs[i + samples]
+        for i in range(n_stored):
+            inputs[i] = inputs[i + samples * stride]
         for i in range(lookahead):
             for k in range(sensors):
                 outputs[i, k] = outputs[i + samples, k]

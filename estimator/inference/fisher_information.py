@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.engine.input_hold import input_degree
-from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
+from estimator.inference.record_arrays import inputs_by_channel, outputs_by_sensor
+from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.model import Model
-from estimator.models.single_input import check_single_input
 from estimator.rigs.physical_parameters import physical_jacobian, to_physical
 from estimator.rigs.units import VOLT_SCALES, Scales
 from estimator.support.argument_checks import MAX_MAGNITUDE, check_number, to_float_array
@@ -43,8 +43,9 @@ def fisher_information(
     Args:
         model: the equation.
         coefficients: (K,) or (n, K), time counted in samples.
-        u: (T,) or (n, T) inputs; the t-th acts over the sample that ends with the t-th output. A series ends before its
-            first NaN, so that episodes of different lengths fit into one array; before its first sample the input is 0.
+        u: (T,) or (n, T) inputs, or (..., T, inputs) of several or none; the t-th acts over the sample that ends with
+            the t-th output. A series ends before its first NaN, so that episodes of different lengths fit into one
+            array; before its first sample the input is 0.
         process_noise: standard deviation of the first sensor's output by the process noise of one sample, in its unit,
             0 or more; (n,) of a batch.
         measurement_noise: the sensors' standard deviations, positive: one number, or one for each; (n, p) of a batch.
@@ -62,25 +63,22 @@ def fisher_information(
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
     degree = input_degree(Model.require_model(model), interpolation)
-    check_single_input("Fisher information", model, "use record_likelihoods with the inputs of each sample")
     noises = noise_variances(model, process_noise, measurement_noise, process_ratios)
     check_number("state_std", state_std, 0, MAX_MAGNITUDE, "0 is at rest")
-    points, inputs = to_float_array("coefficients", coefficients), to_float_array("u", u)
+    points, inputs = to_float_array("coefficients", coefficients), inputs_by_channel(model, u)
     if points.ndim not in (1, 2) or points.shape[-1] != model.n_coefficients:
         raise ValueError(
             f"coefficients must be {list(model.coefficients)} on the last axis, but have shape {points.shape}"
         )
-    if inputs.ndim not in (1, 2):
-        raise ValueError(f"u must have shape (T,) or (n, T), but has {inputs.shape}")
     outputs = None if y is None else outputs_by_sensor(model, inputs, y)
     try:
-        shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-1], noises.shape[:-1])
+        shape = np.broadcast_shapes(points.shape[:-1], inputs.shape[:-2], noises.shape[:-1])
     except ValueError:
-        sizes = points.shape[:-1], inputs.shape[:-1], noises.shape[:-1]
+        sizes = points.shape[:-1], inputs.shape[:-2], noises.shape[:-1]
         raise ValueError(
             f"coefficients, u and noises must be batches of one size, but have {sizes}; repeat the smaller"
         ) from None
-    rows, samples = int(np.prod(shape)), inputs.shape[-1]
+    rows, samples = int(np.prod(shape)), inputs.shape[-2]
 
     def broadcast(array: FloatArray, *last: int) -> FloatArray:
         return np.broadcast_to(array, (*shape, *last)).reshape(rows, *last).copy()
@@ -89,7 +87,7 @@ def fisher_information(
     filtered = record_likelihoods(
         model,
         broadcast(points, model.n_coefficients),
-        inputs_by_sample(model, broadcast(inputs, samples), degree),
+        inputs_by_sample(model, broadcast(inputs, samples, model.n_inputs), degree),
         None if outputs is None else broadcast(outputs, samples, model.n_outputs),
         broadcast(noises, noises.shape[-1]),
         covariance,

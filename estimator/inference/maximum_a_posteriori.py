@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine.input_hold import input_degree
-from estimator.inference.record_filter import inputs_by_sample, noise_variances, outputs_by_sensor, record_likelihoods
+from estimator.inference.record_arrays import inputs_by_channel, outputs_by_sensor
+from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.model import Model
-from estimator.models.single_input import check_single_input
 from estimator.support.argument_checks import to_float_array
 from estimator.support.array_types import FloatArray
 
@@ -80,7 +80,7 @@ def maximum_a_posteriori(
 
     Args:
         model: the equation.
-        u: (n, T) inputs, likewise.
+        u: (n, T) inputs, or (n, T, inputs) of several or none, likewise.
         y: (n, T) outputs, or (n, T, p) of p sensors.
         prior: belief in the coefficients and in the state about rest. Its noises are not used. A coefficient of
             variance 0 is fixed.
@@ -94,10 +94,9 @@ def maximum_a_posteriori(
     Raises:
         ValueError: naming the argument, if its shape does not fit or a number is out of range.
     """
-    check_single_input("a fit", model, "estimate in an environment of it")
-    inputs = to_float_array("u", u)
-    if inputs.ndim != 2:
-        raise ValueError(f"u must have shape (n, T), but has {inputs.shape}")
+    inputs = inputs_by_channel(model, u)
+    if inputs.ndim != 3:
+        raise ValueError(f"u must be of n records, but has shape {np.shape(u)}; pass u[None] for one")
     outputs = np.array(outputs_by_sensor(model, inputs, y))
     noises = noise_variances(model, process_noise, measurement_noise, process_ratios)
     sample_inputs = inputs_by_sample(model, inputs, input_degree(model, interpolation))

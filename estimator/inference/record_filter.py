@@ -86,11 +86,11 @@ def record_likelihoods(
         initial_state_slopes: (n, n_states, K) derivatives of ``initial_state`` by the coefficients; None for all 0.
     """
     k, upper = model.n_coefficients, _upper_triangle(model.n_coefficients)
-    lengths = record_lengths(inputs[:, :, 0])
+    lengths = record_lengths(inputs)
     totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
     initial_moments = _initial_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
-    degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous else 0
+    degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.inputs else 0
     outputs = np.zeros((0, 0, 0)) if y is None else y
     forecast_array = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
     lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
@@ -331,20 +331,3 @@ def noise_variances(
     sensors = np.broadcast_to(stds, (*shape, model.n_outputs))
     process, *sources = (np.broadcast_to(column, shape)[..., None] for column in columns)
     return np.concatenate([process, sensors, *sources], axis=-1) ** 2
-
-
-def outputs_by_sensor(model: Model, inputs: FloatArray, y: npt.ArrayLike) -> FloatArray:
-    """Outputs (..., T, p) paired with inputs (..., T); one sensor may omit the last axis.
-
-    Raises:
-        ValueError: for another shape.
-    """
-    outputs = to_float_array("y", y)
-    if model.n_outputs == 1 and outputs.shape == inputs.shape:
-        outputs = outputs[..., None]
-    if outputs.shape != (*inputs.shape, model.n_outputs):
-        raise ValueError(
-            f"u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have "
-            f"{inputs.shape} and {outputs.shape}; transpose or cut one"
-        )
-    return outputs

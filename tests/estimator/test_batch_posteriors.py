@@ -61,7 +61,10 @@ def test_several_sensors(records):
 @table(
     ("call", "message"),
     [
-        (lambda u: posteriors(u[0], u[0], silverbox_prior()), "u must have shape (n, T), but has (40,)"),
+        (
+            lambda u: posteriors(u[0], u[0], silverbox_prior()),
+            "u must be of n records, but has shape (40,); pass u[None] for one",
+        ),
         (
             lambda u: posteriors(u, u[:, :-1], silverbox_prior()),
             "u and y must have one shape, (T,) or (n, T), and y a last axis for several sensors, but have (35, 40)",

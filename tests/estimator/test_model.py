@@ -105,10 +105,15 @@ def test_free_runs_of_many_systems_are_those_of_each():
     assert free_run(model, c, u[0]).shape == (3, 4)
 
 
-@table(("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((1,), (), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))])
+@table(("c", "u", "state"), [((2, 1), (3, 4), (1,)), ((2,), (4,), (1,)), ((1,), (4,), (2, 3))])
 def test_a_free_run_names_the_shapes_that_do_not_fit(c, u, state):
     with pytest.raises(ValueError, match="or one more axis for systems, but have"):
         free_run(Model(**TANK), np.ones(c), np.ones(u), np.ones(state))
+
+
+def test_a_free_run_refuses_a_number_for_a_series():
+    with pytest.raises(ValueError, match=r"u must have shape \(T,\) or \(n, T\), but has \(\)"):
+        free_run(Model(**TANK), [0.4], 1.0, [1.0])
 
 
 def test_the_information_of_powers_is_that_of_differences():

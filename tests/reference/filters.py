@@ -38,7 +38,7 @@ FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "s
 
 @dataclass(frozen=True)
 class Plant:
-    """A model as ordinary functions of a state z (n,), coefficients c (K,) and the input.
+    """A model as ordinary functions of a state z (n,), coefficients c (K,) and the input: a number, or (inputs,).
 
     A function may give a number for each of its rows where z is of columns (n, m).
 
@@ -68,17 +68,20 @@ class Plant:
     def of(cls, model, ratios=None) -> Plant:
         """The plant of a declaration's strings; ``ratios``: factor on each state's noise."""
 
-        def evaluated(texts, z, c, **inputs):
-            names = dict(zip(model.names, [*z, *c], strict=True)) | inputs | {"pi": np.pi, **model.constants}
+        def evaluated(texts, z, c, taps=()):
+            """Values of texts, with the inputs of one age after the other, newest first."""
+            names = dict(zip(model.names, [*z, *c], strict=True)) | {"pi": np.pi, **model.constants}
+            for suffix, values in zip(("", "[-1]", "[-2]"), taps, strict=False):
+                written = (f"{name}{suffix}" for name in model.inputs)
+                names |= dict(zip(written, np.atleast_1d(values), strict=True))
             return [evaluate(parse(text, model.name), names, FUNCTIONS) for text in texts]
 
         def move(z, c, u):
-            inputs = {"u": u} if model.is_continuous else dict(zip(("u", "u[-1]", "u[-2]"), u, strict=False))
-            return evaluated(model.update_expressions, z, c, **inputs)
+            return evaluated(model.update_expressions, z, c, [u] if model.is_continuous else u)
 
         return cls(
             move,
-            lambda z, c, u: evaluated(model.outputs.values(), z, c, u=u),
+            lambda z, c, u: evaluated(model.outputs.values(), z, c, [u]),
             lambda z, c: np.multiply(evaluated(model.noise, z, c), 1.0 if ratios is None else ratios),
             substeps=model.substeps if model.is_continuous else 0,
             held=model.held,
@@ -123,13 +126,13 @@ def runge_kutta(slope: Callable, x: np.ndarray, substeps: int = 1) -> np.ndarray
 
 
 def polynomial(inputs: Sequence[float], t: float) -> float:
-    """The input at a time t in [0, 1] of the sample."""
+    """The input, or the inputs, at a time t in [0, 1] of the sample."""
     return sum(u * t**k for k, u in enumerate(inputs))
 
 
 def acting(plant: Plant, u: np.ndarray, t: int, interpolation: str) -> tuple[float, ...]:
-    """The inputs of sample t of a record u (T,) before which there was none: three taps, or the polynomial."""
-    taps = [u[t - k] if t >= k else 0.0 for k in range(3)]
+    """The inputs of sample t of a record u (T,) or (T, inputs), 0 before it: three taps, or the polynomial."""
+    taps = [u[t - k] if t >= k else 0.0 * u[0] for k in range(3)]
     if not plant.substeps:
         return tuple(taps)
     return {"zero_order": (taps[0],), "linear": (taps[1], taps[0] - taps[1])}[interpolation]
