@@ -1,4 +1,4 @@
-"""`python -m benchmarks.compat`: see the package."""
+"""Print the compatibility table: ``python -m benchmarks.compat [LIBRARY ...]``."""
 
 import json
 import os
@@ -15,7 +15,7 @@ LIBRARIES = {kind.__name__: kind for kind in (Gymnasium, TorchRL, Tianshou, Stab
 
 
 def cell(run: Callable[[], None] | None) -> str:
-    """How a cell went."""
+    """``yes``, ``-`` where there is nothing to run, or the error."""
     if run is None:
         return "-"
     try:
@@ -26,7 +26,7 @@ def cell(run: Callable[[], None] | None) -> str:
 
 
 def row(name: str) -> list[str]:
-    """A library's cells, run in this process."""
+    """The row of a library, run in this process: its name and version, and its cells."""
     warnings.simplefilter("ignore")
     library = LIBRARIES[name]()
     return [f"{name} {version(library.package)}", *(cell(getattr(library, each)) for each in CELLS)]
@@ -40,7 +40,7 @@ def main() -> int:
     print(f"| with Gymnasium {version('gymnasium')} | {' | '.join(CELLS)} |\n|---|{'---|' * len(CELLS)}", flush=True)
     failed = 0
     for name in sys.argv[1:] or LIBRARIES:
-        with tempfile.TemporaryDirectory() as folder:  # of Minari's data sets
+        with tempfile.TemporaryDirectory() as folder:  # for Minari's data sets
             command = [sys.executable, "-m", "benchmarks.compat", "--row", name]
             environment = {**os.environ, "MINARI_DATASETS_PATH": folder}
             done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

@@ -1,26 +1,32 @@
-"""The rows of the compatibility table: a library each, with a function for each cell."""
+"""Rows of the compatibility table: one class for each library, with a method for each cell."""
 
 import gymnasium as gym
 import numpy as np
 
 ID = "duffing_env:duffing_env/Short-v0"
+
+#: Keys of the info of every step.
 KEYS = {"information_gain", "log_posterior_gain", "diverged"}
+
+#: Environments of a vector environment.
 ROWS = 4
+
+#: Columns of the table: one environment, a vector environment, a short training, the infos.
 CELLS = ("single", "vector", "train", "infos")
 
 
-def made(autoreset_mode="SameStep"):
-    """Ours, as a vector environment of Gymnasium."""
+def make_vector(autoreset_mode="SameStep"):
+    """Make this project's vector environment of Gymnasium."""
     return gym.make_vec(ID, num_envs=ROWS, vectorization_mode="vector_entry_point", autoreset_mode=autoreset_mode)
 
 
 class Gymnasium:
-    """Its checker, wrappers and vector environments."""
+    """Gymnasium: its checker, wrappers and vector environments."""
 
     package = "gymnasium"
 
     def single(self):
-        """Checked, with its time limit and time, and remade from its specification."""
+        """Check the environment; make it again from its specification, with another time limit."""
         from gymnasium.utils.env_checker import check_env
 
         check_env(gym.make(ID).unwrapped, skip_render_check=True)
@@ -30,19 +36,18 @@ class Gymnasium:
         assert [step[3] for step in steps] == [False] * 19 + [True]
 
     def vector(self):
-        """Ours and its own, in all modes, under wrappers."""
+        """Step our vector environment under wrappers in every autoreset mode, and the two of Gymnasium."""
         from gymnasium.vector import AutoresetMode
         from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 
         for mode in AutoresetMode:
-            envs = gym.make_vec(ID, num_envs=ROWS, vectorization_mode="vector_entry_point", autoreset_mode=mode)
-            envs = NormalizeReward(RecordEpisodeStatistics(envs))
+            envs = NormalizeReward(RecordEpisodeStatistics(make_vector(mode)))
             envs.reset(seed=0)
             for _ in range(48):
                 *_, infos = envs.step(envs.action_space.sample())
             assert "episode" in infos
-        for way in ("sync", "async"):
-            envs = gym.make_vec(ID, num_envs=2, vectorization_mode=way)
+        for mode in ("sync", "async"):
+            envs = gym.make_vec(ID, num_envs=2, vectorization_mode=mode)
             envs.reset(seed=0)
             envs.step(envs.action_space.sample())
             envs.close()
@@ -50,25 +55,25 @@ class Gymnasium:
     train = None
 
     def infos(self):
-        """The same keys at a reset and every step; belief and truth at the end."""
+        """Find the same keys after a reset and every step, and belief and truth at the end of an episode."""
         env = gym.make(ID)
-        given = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
-        assert all(info.keys() == KEYS for info in given)
+        infos = [env.reset(seed=0)[1], *(env.step(env.action_space.sample())[4] for _ in range(48))]
+        assert all(info.keys() == KEYS for info in infos)
         assert env.unwrapped.belief.physical()[0].shape == (len(env.unwrapped.truth),)
-        envs = made()
+        envs = make_vector()
         envs.reset(seed=0)
         for _ in range(48):
-            *_, infos = envs.step(envs.action_space.sample())
-        assert {"belief", "truth"} | KEYS <= infos["final_info"].keys()
+            *_, last = envs.step(envs.action_space.sample())
+        assert {"belief", "truth"} | KEYS <= last["final_info"].keys()
 
 
 class TorchRL:
-    """``GymEnv``, ``GymWrapper``, its collector and PPO."""
+    """TorchRL: ``GymEnv``, ``GymWrapper``, its collector and PPO."""
 
     package = "torchrl"
 
     def single(self):
-        """By its id, checked."""
+        """Make the environment by its id, check it and play it."""
         from torchrl.envs import GymEnv
         from torchrl.envs.utils import check_env_specs
 
@@ -77,14 +82,14 @@ class TorchRL:
         assert env.rollout(100)["next", "done"].sum() == 1
 
     def vector(self):
-        """Ours, wrapped; it takes no ``NextStep``."""
+        """Wrap our vector environment, with autoreset off: TorchRL takes no ``NextStep``."""
         from torchrl.envs import GymWrapper
 
-        rolled = GymWrapper(made("Disabled")).rollout(100, break_when_any_done=False)
+        rolled = GymWrapper(make_vector("Disabled")).rollout(100, break_when_any_done=False)
         assert rolled["next", "done"].sum() == 2 * ROWS
 
     def train(self):
-        """Its collector, advantage and clipped loss."""
+        """Train with its collector, advantage estimate and clipped loss."""
         import torch
         from tensordict.nn import TensorDictModule
         from torchrl.collectors import Collector
@@ -114,7 +119,7 @@ class TorchRL:
         assert iterations == 3
 
     def infos(self):
-        """Of many by its own reader; of one by a reader that makes arrays of Python's numbers."""
+        """Read infos of a vector environment by its own reader, of one environment by a reader of Python's numbers."""
         from torchrl.data import Unbounded
         from torchrl.envs import GymEnv, GymWrapper, default_info_dict_reader
 
@@ -123,7 +128,7 @@ class TorchRL:
                 return super().__call__({name: np.asarray(value) for name, value in info.items()}, tensordict)
 
         numbers = dict.fromkeys(sorted(KEYS), Unbounded((ROWS,)))
-        many = GymWrapper(made("Disabled"))
+        many = GymWrapper(make_vector("Disabled"))
         many.set_info_dict_reader(default_info_dict_reader(sorted(KEYS), numbers))
         for envs in (GymEnv(ID).auto_register_info_dict(info_dict_reader=Reader()), many):
             rolled = envs.rollout(10)
@@ -132,7 +137,7 @@ class TorchRL:
 
 
 class Tianshou:
-    """Its vector environments, collector and PPO."""
+    """Tianshou: its vector environments, collector and PPO."""
 
     package = "tianshou"
 
@@ -161,22 +166,22 @@ class Tianshou:
         critic = ContinuousCritic(preprocess_net=Net(state_shape=space.shape, hidden_sizes=[16]))
         policy = ProbabilisticActorPolicy(
             actor=actor, action_space=actions,
-            dist_fn=lambda given: torch.distributions.Independent(torch.distributions.Normal(*given), 1),
+            dist_fn=lambda moments: torch.distributions.Independent(torch.distributions.Normal(*moments), 1),
         )  # fmt: skip
         return PPO(policy=policy, critic=critic, optim=AdamOptimizerFactory(lr=1e-3))
 
     def single(self):
-        """One environment in its collector."""
+        """Collect an episode of one environment."""
         collector, *_ = self._collector(1, 100)
         assert collector.collect(n_episode=1).lens[0] == 48
 
     def vector(self):
-        """Several environments in its collector."""
+        """Collect episodes of several environments."""
         collector, *_ = self._collector(ROWS, 1000)
         assert collector.collect(n_episode=8).n_collected_episodes == 8
 
     def train(self):
-        """Three rounds of collecting and updating."""
+        """Collect and update three times."""
         from tianshou.utils.torch_utils import policy_within_training_step
 
         collector, algorithm, buffer = self._collector(ROWS, 400)
@@ -187,16 +192,16 @@ class Tianshou:
             collector.reset_buffer(keep_statistics=True)
 
     def infos(self):
-        """In its replay buffer."""
+        """Find infos in its replay buffer."""
         collector, _, buffer = self._collector(ROWS, 400)
         collector.collect(n_episode=4)
-        given = buffer.sample(0)[0].info
-        assert set(given.keys()) >= KEYS
-        assert np.count_nonzero(given.information_gain)
+        info = buffer.sample(0)[0].info
+        assert set(info.keys()) >= KEYS
+        assert np.count_nonzero(info.information_gain)
 
 
 class StableBaselines3:
-    """Its checker, PPO on one environment and on ours, wrapped."""
+    """Stable-Baselines3: its checker, and its PPO on one environment and on our vector environment."""
 
     package = "stable-baselines3"
 
@@ -211,29 +216,29 @@ class StableBaselines3:
         return PPO("MlpPolicy", envs, n_steps=48, batch_size=48, policy_kwargs={"net_arch": [16]}, device="cpu")
 
     def single(self):
-        """Checked, and in its own way to many."""
+        """Check the environment, and train on it as Stable-Baselines3 wraps it."""
         from stable_baselines3.common.env_checker import check_env
 
         check_env(gym.make(ID))
         self._ppo(gym.make(ID)).learn(48)
 
     def vector(self):
-        """Ours, made and wrapped by the user."""
+        """Take a vector environment under a wrapper of the user's."""
         from gymnasium.wrappers.vector import TransformReward
 
         from agents.sb3_vec_env import DuffingVecEnv
 
-        envs = DuffingVecEnv(TransformReward(made(), lambda reward: 0.1 * reward))
+        envs = DuffingVecEnv(TransformReward(make_vector(), lambda reward: 0.1 * reward))
         envs.reset()
         envs.step(np.zeros((ROWS, 1), dtype=np.float32))
         assert envs.get_attr("truth", 2)[0].m == envs.envs.unwrapped.truth.m[2]
 
     def train(self):
-        """On ours."""
+        """Train on our vector environment."""
         self._ppo(self._envs()).learn(3 * 48 * ROWS)
 
     def infos(self):
-        """The last step's of each episode."""
+        """Find belief, truth and episode statistics in the last info of each episode."""
         envs = self._envs()
         envs.reset()
         for _ in range(48):
@@ -242,42 +247,42 @@ class StableBaselines3:
 
 
 class RLlib:
-    """Its PPO, on one environment and on ours."""
+    """RLlib: its PPO, on one environment and on our vector environment."""
 
     package = "ray"
 
-    def _algorithm(self, many=False):
+    def _algorithm(self, vector=False):
         import ray
         from ray.rllib.algorithms.ppo import PPOConfig
 
         ray.init(num_cpus=1, include_dashboard=False, object_store_memory=10**8, ignore_reinit_error=True)
-        given = {"num_envs_per_env_runner": ROWS, "gym_env_vectorize_mode": "vector_entry_point"} if many else {}
-        config = PPOConfig().environment(ID).env_runners(num_env_runners=0, **given)
+        options = {"num_envs_per_env_runner": ROWS, "gym_env_vectorize_mode": "vector_entry_point"} if vector else {}
+        config = PPOConfig().environment(ID).env_runners(num_env_runners=0, **options)
         return config.training(train_batch_size=192, minibatch_size=96, num_epochs=1).build_algo()
 
     def single(self):
-        """One environment in its runner."""
+        """Sample an episode of one environment with its runner."""
         assert self._algorithm().env_runner.sample(num_episodes=1)[0].is_done
 
     def vector(self):
-        """Ours in its runner."""
-        algorithm = self._algorithm(many=True)
+        """Sample episodes of our vector environment with its runner."""
+        algorithm = self._algorithm(vector=True)
         assert len(algorithm.env_runner.sample(num_episodes=ROWS)) >= ROWS
 
     def train(self):
-        """On ours."""
-        algorithm = self._algorithm(many=True)
+        """Train on our vector environment."""
+        algorithm = self._algorithm(vector=True)
         results = [algorithm.train() for _ in range(3)]
         assert np.isfinite(results[-1]["env_runners"]["episode_return_mean"])
 
     def infos(self):
-        """In its episodes."""
+        """Find infos in its episodes."""
         (episode, *_) = self._algorithm().env_runner.sample(num_episodes=1)
         assert all(info.keys() >= KEYS for info in episode.get_infos())
 
 
 class Minari:
-    """Its collector; it takes single environments."""
+    """Minari: its collector, which takes one environment."""
 
     package = "minari"
 
@@ -291,17 +296,17 @@ class Minari:
             while not done:
                 _, _, terminated, truncated, _ = collector.step(collector.action_space.sample())
                 done = terminated or truncated
-        given = {"algorithm_name": "random", "code_permalink": "none", "author": "none", "author_email": "none@none"}
-        return collector.create_dataset(dataset_id=f"duffing/short-{infos}/random-v0", **given)
+        about = {"algorithm_name": "random", "code_permalink": "none", "author": "none", "author_email": "none@none"}
+        return collector.create_dataset(dataset_id=f"duffing/short-{infos}/random-v0", **about)
 
     def single(self):
-        """Episodes into a data set."""
+        """Collect episodes into a data set."""
         assert self._dataset(False).total_steps == 3 * 48
 
     vector = train = None
 
     def infos(self):
-        """With ``record_infos``: of the reset and of every step."""
+        """Record infos of the reset and of every step, with ``record_infos``."""
         for episode in self._dataset(True).iterate_episodes():
             assert episode.infos.keys() == KEYS
             assert len(episode.infos["information_gain"]) == 49

@@ -3,8 +3,8 @@
 $ python -m benchmarks.fuzz --inputs 50000
 $ python -m benchmarks.fuzz --inputs 500 --areas files commands --seed 7
 
-Each area runs in a process of its own: a process that dies is counted and does not end the others. The exit status is 1
-after a fault. The same seed and number give the same inputs.
+Each area runs in a process of its own. A process that dies counts as a crash and does not end the others. The exit
+status is 1 after a fault. The same seed and number give the same inputs.
 """
 
 import importlib
@@ -22,7 +22,7 @@ import hypothesis
 
 from agents.cli import run_script
 
-#: Area to its module here, and the share of the inputs that it gets.
+#: Share of the inputs of each area. An area is a module ``fuzz_<area>``.
 AREAS = {
     "estimators": 0.25,
     "constructors": 0.32,
@@ -33,6 +33,7 @@ AREAS = {
     "commands": 0.02,
 }
 
+#: Verdicts on calls.
 KINDS = ("result", "clear error", "unclear error", "unsound result", "state changed", "hang", "crash")
 
 
@@ -41,15 +42,15 @@ class Config:
     """Try bad inputs."""
 
     inputs: int = 5000
-    """Inputs, over all areas."""
+    """Number of inputs, over all areas."""
     seed: int = 0
     """Seed of the inputs."""
     areas: tuple[str, ...] = tuple(AREAS)
     """Areas to try."""
     json: Path | None = None
-    """File for the counts and faults; of one area alone it is written by that area's process."""
+    """File for the counts and faults."""
     inside: bool = False
-    """Whether this is the process of one area."""
+    """Whether this process tries the inputs of one area; set by the program itself."""
 
     def __post_init__(self) -> None:
         if self.inputs < 1 or self.seed < 0:
@@ -60,7 +61,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Try, print the table, and exit with 1 where there was a fault."""
+    """Try the inputs, print the table, and exit with status 1 after a fault."""
     if config.inside:
         inside(config.areas[0], config.inputs, config.seed, config.json)
         return
@@ -99,7 +100,7 @@ def inside(area: str, inputs: int, seed: int, path: Path | None) -> None:
 
 
 def _in_process(area: str, inputs: int, seed: int) -> dict[str, Any]:
-    """The counts of an area's process; a crash where the process died."""
+    """Try an area's inputs in a process of its own, and return its counts; a crash where the process died."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tally.json"
         words = ["--inside", "--areas", area, "--inputs", str(max(1, inputs)), "--seed", str(seed), "--json", str(path)]
@@ -113,7 +114,7 @@ def _in_process(area: str, inputs: int, seed: int) -> dict[str, Any]:
 
 
 def show(found: dict[str, dict[str, Any]], seed: int) -> int:
-    """Print the table and the faults; their number."""
+    """Print the table and the faults; return the number of faults."""
     from agents.console_output import format_table
     from agents.console_output import print_texts_and_tables as print_all
 

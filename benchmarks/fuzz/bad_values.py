@@ -1,4 +1,4 @@
-"""Hypothesis strategies of bad arguments: values of all kinds, and files with a change."""
+"""Strategies of Hypothesis for bad arguments: values of every type, and damaged files."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -24,7 +24,7 @@ _ARRAYS: list[Any] = [
     *(np.ma.masked_array([1.0, 2.0], [False, True]), np.ones(4, dtype=bool), np.ones(3, dtype=">f8")),
 ]
 
-#: Anything.
+#: A value of any type.
 anything: st.SearchStrategy[Any] = st.one_of(
     st.sampled_from(_PLAIN),
     st.sampled_from(_ARRAYS),
@@ -39,31 +39,31 @@ sizes = st.one_of(st.floats(allow_nan=False), st.floats(-40, 40).map(lambda powe
 
 
 def options(good: dict[str, Any]) -> st.SearchStrategy[dict[str, Any]]:
-    """Arguments, of which one to three are anything; now and then with a name that is unknown."""
+    """Arguments of which one to three have any value; sometimes one has an unknown name."""
     some = st.dictionaries(st.sampled_from([*good, "unknown"]), st.one_of(anything, sizes), min_size=1, max_size=3)
     return some.map(lambda changed: {**good, **changed})
 
 
 @st.composite
 def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
-    """A file's content: cut, with some bits turned over, some bytes put in or taken out; or anything."""
-    kind = draw(st.sampled_from(["cut", "turned", "put in", "taken out", "doubled", "foreign"]))
+    """A file's content: cut, doubled, with bits flipped, bytes inserted or removed, or replaced."""
+    kind = draw(st.sampled_from(["cut", "flipped", "inserted", "removed", "doubled", "replaced"]))
     at = draw(st.integers(0, max(0, len(whole) - 1)))
     if kind == "cut":
         return whole[:at]
-    if kind == "turned":
+    if kind == "flipped":
         content = bytearray(whole)
         for place in draw(st.lists(st.integers(0, max(0, len(whole) - 1)), min_size=1, max_size=12)):
             content[place] ^= 1 << draw(st.integers(0, 7))
         return bytes(content)
-    if kind == "put in":
+    if kind == "inserted":
         return whole[:at] + draw(st.binary(min_size=1, max_size=20)) + whole[at:]
-    if kind == "taken out":
+    if kind == "removed":
         return whole[:at] + whole[at + draw(st.integers(1, 200)) :]
     return whole * 2 if kind == "doubled" else draw(st.binary(max_size=200))
 
 
-#: What JSON and TOML can hold.
+#: Values for a place in JSON or TOML.
 _HELD = [
     *(None, True, 0, -1, 1, 3, 2**40, 10**400, 0.5, -2.5, 1e300, 1e-300),
     *("", "abc", "u*x", [], [1], [[]], {}, {"a": 1}),
@@ -85,7 +85,7 @@ def changed(draw: st.DrawFn, held: Any) -> Any:
 
 @st.composite
 def another_array(draw: st.DrawFn, array: Any) -> Any:
-    """An array with another shape, kind, sign or value."""
+    """An array with another shape, data type, sign or value."""
     change = draw(st.integers(0, 8))
     if change == 0:
         return array[:-1] if array.ndim else np.ones(3)

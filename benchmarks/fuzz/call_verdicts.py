@@ -1,4 +1,4 @@
-"""Fuzzed calls and their verdicts: a result, a clear error, or a fault."""
+"""Calls with fuzzed arguments and their verdicts: a result, a clear error, or a fault."""
 
 import pickle
 import re
@@ -11,10 +11,10 @@ from typing import Any
 from gymnasium.error import Error as GymnasiumError
 from numba.core import event
 
-#: Longer is a hang [s]; compilation is not counted.
+#: A longer call is a hang [s]. Compilation does not count.
 PATIENCE = 10.0
 
-#: How a message of this project, of Gymnasium, or of Python about a call's arguments, says what is wrong.
+#: Words of a clear message from this project, from Gymnasium, or from Python about arguments.
 _CLEAR = re.compile(
     r"\bmust\b|\bis no option\b|\bgoes? (with|together)\b|unexpected keyword argument|required positional argument"
     r"|\bis out of date\b|no hyperparameter|\bis for\b"
@@ -23,15 +23,15 @@ _CLEAR = re.compile(
 
 @dataclass(frozen=True)
 class Call:
-    """Something to try.
+    """A call to try.
 
     Attributes:
-        what: is called, for the table of faults.
-        function: does it.
-        names: of the arguments, one of which a clear message has.
-        state: gives the part that a failed call must not change.
-        sound: whether a result is one; says what is wrong with it, or nothing.
-        given: arguments, to show with a fault.
+        what: name in the table of faults.
+        function: calls with the fuzzed arguments.
+        names: names of arguments; a clear message has one of them.
+        state: returns the state that a failed call must not change.
+        sound: says what is wrong with a result; empty where nothing is.
+        given: arguments to print with a fault.
     """
 
     what: str
@@ -43,10 +43,10 @@ class Call:
 
 
 class Judge:
-    """Tries calls, and counts.
+    """Tries calls and counts the verdicts.
 
     Attributes:
-        tally: ``counts`` of calls by the way they ended, ``faults`` by what they are, and their first ``examples``.
+        tally: ``counts`` by verdict, ``faults`` by verdict and call, and the first of the ``examples`` of each fault.
     """
 
     def __init__(self) -> None:
@@ -55,13 +55,13 @@ class Judge:
         event.register("numba:compile", self._compiling)
 
     def judge(self, call: Call) -> None:
-        """Try a call."""
+        """Try a call and count its verdict."""
         before = pickle.dumps(call.state()) if call.state else b""
         began = time.perf_counter() - self._compiled()
         kind, fault, example = "result", "", ""
         try:
-            fault = call.sound(call.function())
-            kind, fault = ("unsound result", f"{call.what}: {fault}") if fault else ("result", "")
+            if wrong := call.sound(call.function()):
+                kind, fault = "unsound result", f"{call.what}: {wrong}"
         except MemoryError:
             kind, fault = "crash", f"{call.what}: MemoryError"
         except Exception as error:
@@ -77,12 +77,12 @@ class Judge:
             self.tally["examples"].setdefault(f"{kind}: {fault}", f"{example} {call.given!r}"[:400])
 
     def _compiled(self) -> float:
-        """Seconds that Numba has compiled so far."""
+        """Time that Numba has compiled so far [s]."""
         return float(self._compiling.duration) if self._compiling.done else 0.0
 
 
 def _kind_of(error: Exception, names: tuple[str, ...]) -> str:
-    """Whether an error is clear: of a kind that is promised, and names an argument."""
+    """``clear error`` where the error is of a documented type and its message names an argument and what is wrong."""
     message = str(error)
     known = isinstance(error, ValueError | TypeError | FileNotFoundError | GymnasiumError)
     named = any(name in message for name in names)

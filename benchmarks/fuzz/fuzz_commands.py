@@ -1,4 +1,4 @@
-"""Fuzzing of ``duffing-env`` command lines: each must end with status 0 or 2, and give the reason in one line."""
+"""Fuzzing of ``duffing-env`` command lines: each must end with status 0, 1 or 2, and 2 with a message."""
 
 import contextlib
 import io
@@ -13,6 +13,7 @@ from agents.leaderboard.leaderboard_file import SHIPPED_LEADERBOARD
 from benchmarks.fuzz.call_verdicts import Call
 from benchmarks.fuzz.fuzz_estimators import RIG
 
+#: Words to put behind a command.
 _WORDS = [
     *("rig", "init", "list", "identify", "export", "run", "--help", "--from", "--report", "--json", "rig.toml"),
     *("record.csv", "short.csv", "none", "beam", "-1", "0", "1e999", "nan", "\ud800", "a" * 300, ".", "/dev/null"),
@@ -22,6 +23,7 @@ _WORDS = [
     *("\x1b[31m", "", "--bound", "--board", "board.jsonl"),
 ]  # fmt: skip
 
+#: Commands.
 _FIRST = [
     *(["rig", "list"], ["rig", "init"], ["identify"], ["run"], ["report"], ["report", "--board", "board.jsonl"], []),
     *(["evaluate", "--systems", "1"], ["evaluate", "--protocol"], ["export"], ["export", "prbs", "--output", "x.csv"]),
@@ -30,7 +32,7 @@ _FIRST = [
 
 
 def calls() -> st.SearchStrategy[Call]:
-    """Calls of the command."""
+    """Calls of the command ``duffing-env``."""
     place = Path(tempfile.mkdtemp(prefix="fuzz-"))
     os.chdir(place)
     Path("rig.toml").write_text(RIG.to_toml())
@@ -54,7 +56,7 @@ def calls() -> st.SearchStrategy[Call]:
             said = errors.getvalue()
             if "Traceback" in said or status not in (0, 1, 2, None):
                 return f"status {status}: {said[:200]}"
-            return "status 2 without a word" if status == 2 and not (said or printed.getvalue()).strip() else ""
+            return "status 2 without a message" if status == 2 and not (said or printed.getvalue()).strip() else ""
 
         return Call(f"duffing-env {' '.join(first)}", function, ("must",), sound=str)
 

@@ -55,7 +55,7 @@ _POINT = coefficients_of(difference(), SILVERBOX_TWIN)
 _NOISES = {"process_noise": 5e-4, "measurement_noise": 5e-4, "noise_shape": 2.0, "state_std": 1e-3}
 _EYE = np.eye(4)
 
-#: What is called, with arguments that are right.
+#: Functions to call, by name, with good arguments.
 MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "OnlineEstimator": (
         OnlineEstimator,
@@ -94,7 +94,7 @@ MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "paper_text_prior": (paper_text_prior, {"nonlinear": True, "model": None}),
     "relative_covariance": (relative_covariance, {"model": difference(), "coefficients": _POINT, "covariance": _EYE}),
     "Parameters": (lambda values: Parameters(values), {"values": _TWIN}),
-    "identify": (identify, {"rig": RIG, "records": (np.ones(5), np.ones(5))}),  # too short
+    "identify": (identify, {"rig": RIG, "records": (np.ones(5), np.ones(5))}),  # records that are too short
     "save_estimator": (save_estimator, {"estimator": OnlineEstimator(), "path": "estimator.npz"}),
     "save_policy": (save_policy, {"folder": "policy", "model": 3, "card": None, "normalizer": None}),
     "draw_signal": (draw_signal, {"name": "prbs", "samples": 64, "max_input": 0.15, "max_rms": None, "seed": 0}),
@@ -107,16 +107,16 @@ MADE: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
 }  # fmt: skip
 
-#: Numbers of these would each compile a kernel of their own, or be tried where nothing is wrong with them.
+#: Arguments whose every number compiles a kernel; from 1 to 1,000 they keep their good value.
 _COSTLY = {"OnlineEstimator": ("iterations", "noise_hypotheses", "model", "prior")}
 
 
 def calls() -> st.SearchStrategy[Call]:
     """Calls of constructors and functions."""
-    place = Path(tempfile.mkdtemp(prefix="fuzz-")) / "here"  # some write, and "../x" is a name, too
+    place = Path(tempfile.mkdtemp(prefix="fuzz-")) / "here"  # some functions write files, also to "../x"
     place.mkdir()
     os.chdir(place)
-    importlib.import_module("torch")  # takes seconds, which are not a hang
+    importlib.import_module("torch")  # an import of seconds within a call would count as a hang
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:

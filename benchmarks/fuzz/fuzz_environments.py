@@ -11,7 +11,7 @@ import duffing_env  # noqa: F401  registers the tracks
 from benchmarks.fuzz.bad_values import anything
 from benchmarks.fuzz.call_verdicts import Call
 
-#: Single and vector environments to play in.
+#: Environments by name: track, options, and number of environments; 0 for a single one.
 MADE: dict[str, tuple[str, dict[str, Any], int]] = {
     "Amplitude-v0": ("duffing_env/Amplitude-v0", {"horizon": 20}, 0),
     "Power-v0, held": ("duffing_env/Power-v0", {"horizon": 20, "hold": 3}, 0),
@@ -21,8 +21,8 @@ MADE: dict[str, tuple[str, dict[str, Any], int]] = {
 }
 
 
-def made(name: str) -> Any:
-    """The environment, in the middle of an episode."""
+def make(name: str) -> Any:
+    """Make an environment, in the middle of an episode."""
     track, options, rows = MADE[name]
     if rows:
         env: Any = gym.make_vec(track, num_envs=rows, vectorization_mode="vector_entry_point", **options)
@@ -34,18 +34,18 @@ def made(name: str) -> Any:
 
 
 def unsound(env: Any, result: Any) -> str:
-    """What is wrong with what `reset` or `step` gave, or nothing."""
+    """What is wrong with a result of `reset` or `step`; empty where nothing is."""
     observation = result[0]
     if not env.observation_space.contains(observation):
-        return "observation out of bounds"
+        return "the observation is out of bounds"
     if len(result) == 5 and not np.isfinite(result[1]).all():
-        return "reward is not finite"
+        return "the reward is not finite"
     return ""
 
 
 def calls() -> st.SearchStrategy[Call]:
     """Calls of an environment's methods."""
-    pool = {name: pickle.dumps(made(name)) for name in MADE}
+    pool = {name: pickle.dumps(make(name)) for name in MADE}
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:

@@ -1,4 +1,4 @@
-"""Fuzzing of online estimators: every method with series of any scale, or bad values instead."""
+"""Fuzzing of online estimators: every method with series of any scale, or with bad values."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -13,11 +13,13 @@ from benchmarks.fuzz.call_verdicts import Call
 from estimator import Channel, OnlineEstimator, Rig, difference, duffing, silverbox_prior
 from estimator.belief import check_belief_record
 
+#: Guess of m [kg], c [N·s/m], a [N/m] and b [N/m³].
 _GUESS = {"m": (0.3, 0.5), "c": (0.4, 0.8), "a": (2e3, 3e3), "b": (2e7, 6e7)}
 RIG = Rig(1e-3, input=Channel("N", limit=6.0), output=Channel("m", range=0.03, noise=5e-6), guess=_GUESS)
 
 _ODE = duffing()
 
+#: Estimators to call, by name.
 MADE: dict[str, Callable[[], OnlineEstimator]] = {
     "paper": OnlineEstimator,
     "mean field": lambda: OnlineEstimator(factorisation="mean_field"),
@@ -30,8 +32,8 @@ MADE: dict[str, Callable[[], OnlineEstimator]] = {
 }
 
 
-def begun(name: str) -> OnlineEstimator:
-    """An estimator that has seen some samples."""
+def started_estimator(name: str) -> OnlineEstimator:
+    """An estimator after twelve samples."""
     estimator, rng = MADE[name](), np.random.default_rng(0)
     scale = estimator.scales
     estimator.run(0.1 * scale.input * rng.standard_normal(12), 0.01 * scale.output * rng.standard_normal(12))
@@ -43,7 +45,7 @@ def _state(estimator: OnlineEstimator) -> Any:
 
 
 def sound(estimator: OnlineEstimator) -> str:
-    """What is wrong with an estimator's belief, or nothing."""
+    """What is wrong with an estimator's belief; empty where nothing is."""
     try:
         check_belief_record("belief", estimator.model, estimator.belief.record, 1e-5)
     except ValueError as error:
@@ -53,7 +55,7 @@ def sound(estimator: OnlineEstimator) -> str:
 
 @contextmanager
 def suppress_overflow() -> Iterator[None]:
-    """A belief that is one may still overflow later, and say so."""
+    """Let the error pass that says that a belief overflowed: a sound belief may overflow later."""
     try:
         yield
     except ValueError as error:
@@ -63,8 +65,8 @@ def suppress_overflow() -> Iterator[None]:
 
 def calls() -> st.SearchStrategy[Call]:
     """Calls of an estimator's methods."""
-    pool = {name: pickle.dumps(begun(name)) for name in MADE}
-    arrays = {name: begun(name).arrays() for name in MADE}
+    pool = {name: pickle.dumps(started_estimator(name)) for name in MADE}
+    arrays = {name: started_estimator(name).arrays() for name in MADE}
 
     @st.composite
     def series(draw: st.DrawFn, size: int) -> Any:

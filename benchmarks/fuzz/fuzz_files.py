@@ -1,4 +1,4 @@
-"""Fuzzing of files of every kind: truncated, with flipped bits, with other arrays or entries, or of another kind."""
+"""Fuzzing of files of every format: truncated, with flipped bits, other arrays or entries, or other content."""
 
 import io
 import json
@@ -17,17 +17,18 @@ from agents.training.hyperparameters import HYPERPARAMETER_FOLDER, read_hyperpar
 from agents.training.training_config import TrainConfig, describe_run, read_config
 from benchmarks.fuzz.bad_values import another_array, changed, damaged
 from benchmarks.fuzz.call_verdicts import Call
-from benchmarks.fuzz.fuzz_estimators import RIG, begun, sound, suppress_overflow
+from benchmarks.fuzz.fuzz_estimators import RIG, sound, started_estimator, suppress_overflow
 from estimator import OnlineEstimator, Rig, load_estimator, save_estimator
 from estimator.identification.data.record_files import read_record_file
 
+#: A record of 60 samples.
 _RECORD = b"time [s],force [N],displacement [m]\n" + b"".join(
     f"{k * 1e-3:.3f},{k % 7 - 3},{1e-3 * (k % 5)}\n".encode() for k in range(60)
 )
 
 
 def _go_on(path: Path) -> str:
-    """Load an estimator, let it learn, and judge it."""
+    """Load an estimator, update it with 25 samples, and say what is wrong with its belief."""
     estimator: OnlineEstimator = load_estimator(path)
     scale = estimator.scales
     rng = np.random.default_rng(0)
@@ -38,16 +39,16 @@ def _go_on(path: Path) -> str:
 
 
 def _act(folder: Path) -> str:
-    """Load a policy, and let it act; it is finite, and within bounds."""
+    """Load a policy and ask it for actions; say what is wrong with them."""
     policy = load_policy(folder)
     try:
         actions, _ = policy.predict(np.zeros((2, 22), dtype=np.float32), deterministic=True)
-    except ValueError as error:  # a network that is sound, for other observations
+    except ValueError as error:  # a sound network for other observations
         if "observation must have" in str(error):
             return ""
         raise
-    fine = actions.shape == (2, 1) and np.isfinite(actions).all() and np.abs(actions).max() <= 1
-    return "" if fine else f"actions {actions!r}"
+    bounded = actions.shape == (2, 1) and np.isfinite(actions).all() and np.abs(actions).max() <= 1
+    return "" if bounded else f"actions {actions!r}"
 
 
 def _archive(arrays: dict[str, Any]) -> bytes:
@@ -66,7 +67,7 @@ def calls() -> st.SearchStrategy[Call]:
     kinds = ("paper", "look-ahead", "ensemble", "rig")
     estimators = {}
     for name in kinds:
-        save_estimator(begun(name), place / "estimator.npz")
+        save_estimator(started_estimator(name), place / "estimator.npz")
         with np.load(place / "estimator.npz") as archive:
             estimators[name] = ((place / "estimator.npz").read_bytes(), {key: archive[key] for key in archive.files})
     matlab = io.BytesIO()
@@ -76,7 +77,7 @@ def calls() -> st.SearchStrategy[Call]:
     progress = json.dumps(vars(TrainingProgress(steps=5, curve=[(1, 0.5, None)])))
     fields = ("config", *TrainConfig.__dataclass_fields__, "hyperparameter")
     settings, board = (HYPERPARAMETER_FOLDER / "ppo.toml").read_bytes(), "\n".join(entries).encode()
-    #: Kind to the file's name, its content, its reader, words of clear messages, and JSON to change in places.
+    # By format: the file's name, its content, its reader, words of clear messages, and JSON in which to change a place.
     others: dict[str, tuple[str, bytes, Callable[[Path], Any], tuple[str, ...], str]] = {
         "rig": ("file", RIG.to_toml().encode(), Rig.from_file, (), ""),
         "csv": ("record.csv", _RECORD, lambda path: read_record_file(path, RIG), (), ""),
@@ -100,7 +101,7 @@ def calls() -> st.SearchStrategy[Call]:
     def call(draw: st.DrawFn) -> Call:
         kind = draw(st.sampled_from(["estimator"] * 3 + ["policy", *others]))
         number = next(counter) % 4
-        if kind == "mat" and draw(st.integers(0, 9)):  # a process each
+        if kind == "mat" and draw(st.integers(0, 9)):  # each takes a process
             kind = "csv"
         folder = place / f"{kind}{number}"
         folder.mkdir(exist_ok=True)
@@ -109,10 +110,10 @@ def calls() -> st.SearchStrategy[Call]:
         names: tuple[str, ...] = ("path", "rig", "record", "policy", str(path))
         if kind == "estimator":
             known, arrays = estimators[draw(st.sampled_from(kinds))]
-            way = draw(st.integers(0, 2))
-            if way == 0:
+            change = draw(st.integers(0, 2))
+            if change == 0:
                 content = draw(damaged(known))
-            elif way == 1:
+            elif change == 1:
                 key = draw(st.sampled_from(sorted(arrays)))
                 content = _archive({**arrays, key: draw(another_array(arrays[key]))})
             else:
@@ -122,20 +123,20 @@ def calls() -> st.SearchStrategy[Call]:
             path.write_bytes(content)
             return Call("load_estimator", lambda: _go_on(path), names, sound=str)
         if kind == "policy":
-            way = draw(st.integers(0, 3))
+            change = draw(st.integers(0, 3))
             weights, described = dict(tensors), card
-            if way == 0:
+            if change == 0:
                 key = draw(st.sampled_from(sorted(weights)))
                 other = draw(another_array(weights[key]))
                 if np.asarray(other).dtype.str[1:] in ("f4", "f8", "i8", "b1"):
                     weights[key] = np.ascontiguousarray(other, dtype=np.asarray(other).dtype.newbyteorder("="))
-            elif way == 1:
+            elif change == 1:
                 described = draw(
                     changed({name: card[name] for name in ("format", "network", "features") if name in card})
                 )
-            (folder / WEIGHTS_FILE).write_bytes(draw(damaged(save(weights))) if way == 2 else save(weights))
+            (folder / WEIGHTS_FILE).write_bytes(draw(damaged(save(weights))) if change == 2 else save(weights))
             (folder / CARD_FILE).write_bytes(
-                draw(damaged(json.dumps(card).encode())) if way == 3 else json.dumps(described).encode()
+                draw(damaged(json.dumps(card).encode())) if change == 3 else json.dumps(described).encode()
             )
             return Call("load_policy", lambda: _act(folder), names, sound=str)
         described = draw(changed(json.loads(held))) if held else None

@@ -1,4 +1,4 @@
-"""Fuzzing of every track's options: one to three are bad values. An environment that can be made plays five samples."""
+"""Fuzzing of every track's options, one to three of them bad; an environment that can be made plays five samples."""
 
 from dataclasses import fields
 from typing import Any
@@ -15,12 +15,12 @@ from benchmarks.fuzz.fuzz_estimators import RIG
 from duffing_env.plants.silverbox_record import record_available
 from duffing_env.tracks.track_registry import TRACKS
 
-#: What would compile a kernel of its own for every value.
+#: Options whose every value compiles a kernel; most of their values are wrapped in a list, which is refused.
 _COSTLY = {"iterations", "factorisation", "reward", "estimator", "system", "interpolation", "nonlinear"}
 
 
 def calls() -> st.SearchStrategy[Call]:
-    """Calls that make an environment, and play."""
+    """Calls that make an environment and play five samples."""
     tracks = [track for track in TRACKS if record_available() or "Replay" not in track]
     known, made = {}, {}
     for track in tracks:

@@ -11,12 +11,12 @@ from agents.policies import trained_policies
 from benchmarks.fuzz.bad_values import anything, options
 from benchmarks.fuzz.call_verdicts import Call
 
-#: Options that policies have, with their usual values.
+#: Options of policies, with their usual values.
 _USUAL = {"horizon": None, "goal_std": None, "input_cost": 0.0, "seed": 0}
 
 
 def calls() -> st.SearchStrategy[Call]:
-    """Calls that make a policy, or ask one for an action."""
+    """Calls that make a policy or ask it for an action."""
     env = gym.make("duffing_env/Amplitude-v0")
     observation, _ = env.reset(seed=0)
     signals = [name for name in POLICIES if not name.startswith("efe")]
@@ -26,11 +26,11 @@ def calls() -> st.SearchStrategy[Call]:
 
     @st.composite
     def call(draw: st.DrawFn) -> Call:
-        way = draw(st.integers(0, 2))
-        if way == 0:
+        change = draw(st.integers(0, 2))
+        if change == 0:
             name: Any = draw(anything)
             return Call("make_policy of anything", lambda: make_policy(name, env), ("name", "policy"))
-        if way == 1:
+        if change == 1:
             name = draw(st.sampled_from([*POLICIES, *trained_policies()]))
             given = draw(options(dict(_USUAL)))
             given = {key: value for key, value in given.items() if value is not _USUAL.get(key, value) or key == "seed"}
@@ -43,8 +43,8 @@ def calls() -> st.SearchStrategy[Call]:
 
         def function() -> str:
             action, _ = made[name].predict(value, state, begun, deterministic=True)
-            fine = np.isfinite(action).all() and (np.abs(action) <= 1).all() and action.shape[-1:] == (1,)
-            return "" if fine else f"action {action!r}"
+            bounded = np.isfinite(action).all() and (np.abs(action) <= 1).all() and action.shape[-1:] == (1,)
+            return "" if bounded else f"action {action!r}"
 
         return Call(f"{name}: predict", function, ("observation", "state", "episode_start", "entries"), sound=str)
 

@@ -3,11 +3,10 @@
 $ python -m benchmarks.kills --kills 50 --seed 0
 $ python -m benchmarks.kills --kills 6 --commands train run
 
-Each command first runs to its end once, undisturbed. Half of the kills come at a moment between its first output and
-its end, the other half within 50 ms of a moment when it wrote a file. After each kill every file is read, except under
-temporary names. The command is started again as a user would, must end well, and must have kept the measurements from
-before the kill. Where the documentation guarantees the same result, it is compared bit for bit. The exit status is 1
-where any of this failed.
+Each command first runs to its end once. Half of the kills then come at a random moment of a run, the other half within
+50 ms of a moment when the command wrote a file. After each kill every file is read, except under temporary names. The
+command is started again as a user would start it. It must end well and must keep what was measured before the kill.
+Where the documentation guarantees the same result, it is compared bit for bit. The exit status is 1 after any fault.
 """
 
 import os
@@ -27,8 +26,13 @@ from benchmarks.kills.file_integrity import half_written
 from benchmarks.kills.killable_process import started
 from benchmarks.kills.killed_commands import CASES, Case
 
-_NEAR = 0.05  # s
-_PATIENCE = 300.0  # s
+#: Half of the kills are this near to the writing of a file [s].
+_NEAR = 0.05
+
+#: Longest run of a command [s].
+_PATIENCE = 300.0
+
+#: Runs that may end before their kill.
 _TRIES = 50
 
 
@@ -37,24 +41,24 @@ class Config:
     """Kill commands at random moments."""
 
     kills: int = 50
-    """How many, shared among the commands."""
+    """Number of kills, shared among the commands."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the moments."""
     commands: tuple[str, ...] = ()
-    """Names of commands; all if none."""
+    """Names of commands; none stands for all."""
     json: Path | None = None
     """File for the counts."""
 
 
 def main(config: Config) -> None:
-    """Kill, and print the table."""
+    """Kill the commands and print the table."""
     from agents.console_output import format_table, print_texts_and_tables
     from agents.result_files import write_json
 
     unknown = set(config.commands) - set(CASES)
     if unknown:
         raise ValueError(f"commands must be of {list(CASES)}, but are {sorted(unknown)}")
-    os.environ["OMP_NUM_THREADS"] = "1"  # so that a training repeats itself bit for bit
+    os.environ["OMP_NUM_THREADS"] = "1"  # a training then repeats bit for bit
     chosen = {name: CASES[name]() for name in config.commands or CASES}
     tried = [name for name, case in chosen.items() if not case.missing]
     shares = [len(part) for part in np.array_split(np.arange(config.kills), len(tried))]
@@ -69,19 +73,11 @@ def main(config: Config) -> None:
             rows.append([name, "0", f"left out: {case.missing}", "", "", ""])
             continue
         counts = found[name]
-        equal = f"{counts['equal']} of {counts['kills']}" if case.promises else "not promised"
+        equal = f"{counts['equal']} of {counts['kills']}" if case.promises else "not guaranteed"
         lost = f"{counts['lost']:g} {case.unit}"
-        rows.append(
-            [
-                name,
-                str(counts["kills"]),
-                lost,
-                str(counts["half-written"]),
-                f"{counts['resumed']} of {counts['kills']}",
-                equal,
-            ]
-        )
-    heads = ("command", "kills", "lost at most", "half-written files", "goes on", "equal")
+        resumed = f"{counts['resumed']} of {counts['kills']}"
+        rows.append([name, str(counts["kills"]), lost, str(counts["half-written"]), resumed, equal])
+    heads = ("command", "kills", "lost at most", "half-written files", "resumed", "equal")
     print_texts_and_tables(format_table(heads, rows, markdown=True))
     for counts in found.values():
         for fault in counts["faults"]:
@@ -95,7 +91,7 @@ def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[s
     """Kill a command ``kills`` times, and count the outcomes."""
     whole = base / "whole"
     case.prepare(whole)
-    _finish(case, whole, ["rig", "list"], "before")  # the packages are imported
+    _finish(case, whole, ["rig", "list"], "before")  # imports the packages
     began = time.time()
     _finish(case, whole, case.start(whole), "undisturbed")
     times = _times(whole, began)
@@ -126,15 +122,15 @@ def play(case: Case, base: Path, kills: int, rng: np.random.Generator) -> dict[s
 
 
 def _times(folder: Path, began: float) -> list[float]:
-    """When a command that has just ended wrote its files, and when it ended: seconds from its start."""
+    """Seconds from the start of a command to the writing of each file and, last, to its end, which is now."""
     files = (path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
     return [*(at - began for at in files if at > began), time.time() - began]
 
 
 def _kill(case: Case, folder: Path, times: list[float], near: bool, rng: np.random.Generator) -> list[float]:
-    """Start a command and kill it; returns the times that the moment was drawn from.
+    """Start a command and kill it; return the times from which the moment was drawn.
 
-    It begins again if the command was quicker. The machine may be faster now than it was: its times count then.
+    A command that ends before its kill runs again, with its new times: the machine may have become faster.
     """
     for _ in range(_TRIES):
         shutil.rmtree(folder, ignore_errors=True)
@@ -152,7 +148,7 @@ def _kill(case: Case, folder: Path, times: list[float], near: bool, rng: np.rand
 
 
 def _finish(case: Case, folder: Path, words: list[str], when: str) -> None:
-    """Run a command to its end; RuntimeError where it does not end well."""
+    """Run a command to its end; raise RuntimeError unless its exit status is 0."""
     process = started(folder, words)
     process.join(_PATIENCE)
     if process.exitcode != 0:

@@ -10,16 +10,16 @@ import numpy as np
 
 
 def half_written(folder: Path) -> list[tuple[str, str]]:
-    """Files that cannot be read, and why. Temporary ones begin with a dot, or lie in a folder that does."""
+    """Files that cannot be read, and why; without temporary files, whose path has a part that begins with a dot."""
     bad = []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder)
-        # Optuna's lock is a link, and is broken after half a minute.
+        # Optuna's lock is a link that may lead nowhere; Optuna removes it after half a minute.
         if path.is_symlink() or not path.is_file() or any(part.startswith(".") for part in name.parts):
             continue
         try:
             READERS[path.suffix](path)
-        except Exception as error:  # whatever a reader makes of half a file
+        except Exception as error:  # a reader may raise anything at half a file
             bad.append((str(name), f"{type(error).__name__}: {error}"))
     return bad
 
@@ -50,7 +50,7 @@ def _picture(path: Path) -> None:
 
 def _page(path: Path) -> None:
     if not path.read_text().endswith("</html>\n"):
-        raise ValueError("it does not end as a page does")
+        raise ValueError("the page does not end with </html>")
 
 
 def _arrays(path: Path) -> None:
@@ -59,7 +59,7 @@ def _arrays(path: Path) -> None:
             arrays[name]
 
 
-#: How each kind of file is read; another kind is a fault of this program, and says so.
+#: Reader of each suffix. A file with another suffix counts as a fault.
 READERS: dict[str, Callable[[Path], object]] = {
     ".json": lambda path: json.loads(path.read_text()),
     ".jsonl": _lines,
