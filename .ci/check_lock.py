@@ -1,10 +1,10 @@
-"""Whether requirements.lock can be installed from binary files alone, asked for each Python version given.
+"""Check that requirements.lock can be installed from binary files alone, for each given Python version.
 
-``python .ci/check_lock.py 3.11 3.12``. It prints a line per version and exits with 1 if one of them fails. Nothing is
-downloaded but what the index says of the files. The files are those of this machine's system and processor.
+``python .ci/check_lock.py 3.11 3.12`` prints a line for each version and exits with 1 if one fails. It downloads only
+the index's metadata, for files of this machine's system and processor.
 
-pip evaluates the conditions of dependencies for the Python that runs it. So it is asked without dependencies, and
-these are compared with the lock here: every package that another one needs must stand in it, with a fitting version.
+pip evaluates the conditions of dependencies for the Python that runs it. So pip resolves without dependencies, and this
+script compares these with the lock: every package that another one needs must stand in it, with a fitting version.
 """
 
 import json
@@ -20,15 +20,15 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 
-# What torch's own files ask for on machines with an accelerator. torch names the versions.
+# Packages that torch needs on machines with an accelerator. torch pins their versions.
 LEFT_TO_TORCH = ("cuda-", "nvidia-", "triton")
 
-# Extras that `make` does not install: one command needs them, and its test is skipped without.
+# Extras that `make` does not install. One command needs each; its test is skipped without.
 NOT_LOCKED = ("datasets", "ray")
 
 
 def environment(version: str) -> Environment:
-    """What conditions see in the first release of a Python version, which is the one that pip is asked for, too."""
+    """Values for the conditions of dependencies, in the first release of a Python version, which pip takes too."""
     here = default_environment()
     here["python_version"] = version
     here["python_full_version"] = here["implementation_version"] = f"{version}.0"
@@ -39,7 +39,7 @@ def resolve(version: str) -> list[dict]:
     """Return pip's metadata of every line of the lock.
 
     Raises:
-        RuntimeError: if a line has no binary file for this version, with pip's words.
+        RuntimeError: if a line has no binary file for this version, with pip's message.
     """
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
@@ -53,7 +53,7 @@ def resolve(version: str) -> list[dict]:
 
 
 def missing(packages: list[dict], version: str) -> list[str]:
-    """Return what the project and the packages need in this version of Python and the lock does not have."""
+    """Return the needs of the project and its packages that the lock does not meet, for a version of Python."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     locked = {canonicalize_name(package["name"]): package for package in packages}
     wanted = [("pyproject.toml", Requirement(line), "") for line in project["dependencies"]]
@@ -84,7 +84,7 @@ def missing(packages: list[dict], version: str) -> list[str]:
 
 
 def main(versions: list[str]) -> int:
-    """Print a line per version, and return 1 if the lock fails for one."""
+    """Print a line for each version; return 1 if one fails."""
     failed = 0
     for version in versions:
         try:

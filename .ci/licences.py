@@ -4,7 +4,7 @@ from importlib.metadata import Distribution, distributions
 
 
 def licence(package: Distribution) -> str:
-    """The licence expression; or the classifiers'; or the first line of the text."""
+    """The licence expression, else the licences of the classifiers, else the first line of the text."""
     metadata = package.metadata
     classes = [c.split(" :: ")[-1] for c in metadata.get_all("Classifier") or () if c.startswith("License :: ")]
     lines = (metadata.get("License-Expression") or "; ".join(classes) or metadata.get("License") or "").splitlines()

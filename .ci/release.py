@@ -1,8 +1,8 @@
 """Build wheel and sdist from the commit that is checked out, twice, in two clones: `make release`.
 
-They must be the same, byte for byte, and go into ``dist``. All times in them are that of the commit. The wheel must
-hold the packages, the trained policies, the rigs and the licence, and have the version of ``pyproject.toml``; an index
-must be able to show what both say of themselves (twine). ``make release`` then tries the wheel in a clean environment
+Both builds must be the same, byte for byte, and go into ``dist``. All times in them are the commit's. The wheel must
+hold the packages, the trained policies, the rigs and the licence, and have the version of ``pyproject.toml``. twine
+checks that an index can show the metadata. ``make release`` then tests the wheel in a clean environment
 (`tests/test_wheel.py`).
 """
 
@@ -17,17 +17,17 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TWINE = "twine==7.0.0"  # and not in the lock: nothing else needs what it brings
+TWINE = "twine==7.0.0"  # not in the lock: only this script needs it and its dependencies
 WANTED = ("estimator/py.typed", "estimator/rigs/beam.toml", "agents/policies/trained/ppo/short/policy.json")
 
 
 def git(*words: str) -> str:
-    """What git says of this checkout."""
+    """Run git in this checkout; return its output."""
     return subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True).stdout.strip()
 
 
 def build(folder: Path) -> dict[str, bytes]:
-    """Clone the commit into a folder and build there: name of a file to its content."""
+    """Clone the commit into a folder and build there; return the files' contents by name."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
     subprocess.run(["git", "-C", str(folder), "checkout", "--quiet", git("rev-parse", "HEAD")], check=True)
     environment = os.environ | {"SOURCE_DATE_EPOCH": git("log", "-1", "--format=%ct")}
@@ -36,7 +36,7 @@ def build(folder: Path) -> dict[str, bytes]:
 
 
 def check(wheel: Path) -> None:
-    """Refuse a wheel that lacks something, or has another version."""
+    """Refuse a wheel that lacks a file or has another version."""
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
@@ -46,7 +46,7 @@ def check(wheel: Path) -> None:
 
 
 def check_metadata(files: list[Path]) -> None:
-    """Refuse files that an index would not show."""
+    """Refuse files whose metadata an index would not show."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "venv", folder], check=True)
         python = Path(folder) / "bin" / "python"
@@ -57,7 +57,7 @@ def check_metadata(files: list[Path]) -> None:
 def main() -> None:
     """Build twice, compare, check, and put the files into ``dist``."""
     if git("status", "--porcelain"):
-        sys.exit("the checkout must be clean, but has changes: commit them, for a release is a commit")
+        sys.exit("the checkout must be clean, but has changes: commit them, because a release is built from a commit")
     with tempfile.TemporaryDirectory() as folder:
         first, second = (build(Path(folder) / name) for name in ("first", "second"))
     if first != second:

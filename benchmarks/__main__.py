@@ -18,6 +18,8 @@ from benchmarks.section_tables import Section, print_section, print_verdicts
 from benchmarks.timed_rounds import CORES
 
 SectionName = Literal["estimators", "environments", "training", "decisions", "roofline", "scaling", "startup"]
+
+#: Variables that set threads.
 _SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
@@ -71,7 +73,7 @@ def main(config: Config) -> None:
 
 
 def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callable[[str], None]) -> Section:
-    """One section; its module is imported only now, so that none of them weighs on the others' memory and threads."""
+    """Run one section; import its module only now, so that it does not take memory and threads from the others."""
     module = importlib.import_module(f"benchmarks.{name}")
     if name == "estimators":
         module.write_samples(samples)
@@ -81,7 +83,7 @@ def _run(name: str, config: Config, peers: Peers, samples: Path, on_row: Callabl
 
 
 def describe_machine() -> dict[str, Any]:
-    """Processor, cores, and the settings that a reader needs to repeat a run."""
+    """Processor, cores, versions, load and settings of threads."""
     processor = cpuinfo()
     return {
         "processor": f"{processor.get('model name', 'unknown processor')} (family {processor.get('cpu family', '?')})",
@@ -104,7 +106,7 @@ def print_head(machine: dict[str, Any], versions: dict[str, dict[str, str]], rep
 
 
 def cpuinfo() -> dict[str, str]:
-    """Linux's description of the first processor, by its names; the processor's name alone, or nothing, elsewhere."""
+    """Linux's description of the first processor; elsewhere the processor's name alone, or nothing."""
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:

@@ -23,12 +23,15 @@ from estimator.inference import mean_field
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
+#: Standard deviation of both noises [V].
 NOISE = 5e-4
+
+#: Samples of a record.
 SAMPLES = 256
 
 
 def experiment_of(factorisation: str) -> SimulatedExperiment:
-    """Twins, and the default noises."""
+    """An experiment whose systems all are the twin."""
     return SimulatedExperiment(factorisation, plant_spread=0.0, process_noise=NOISE, measurement_noise=NOISE)
 
 
@@ -39,11 +42,8 @@ _PLACE = block_layout(_EXPERIMENT.kernel_spec)
 @cache
 def plant_mover() -> Any:
     """``move_all(blocks, inputs)``: move the plants of all blocks by one sample, noise drawn within."""
-    draw_noise, plant, u = (
-        compile_noise_draw(_PLACE),
-        generated_functions(_EXPERIMENT.kernel_spec).step_plant,
-        _PLACE["U_u_0"] * LANES,
-    )
+    draw_noise, plant = compile_noise_draw(_PLACE), generated_functions(_EXPERIMENT.kernel_spec).step_plant
+    u = _PLACE["U_u_0"] * LANES
 
     @kernel(variant=_EXPERIMENT.kernel_spec.name)
     def move_all(blocks, inputs):

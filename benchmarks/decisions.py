@@ -9,8 +9,10 @@ from agents import make_policy
 from benchmarks.section_tables import Claim, Section
 from benchmarks.timed_rounds import Row, measure
 
-#: Track and policy, to the bars of one environment and of many [µs].
+#: Longest time of a decision for one environment and for many, by track and policy [µs].
 BARS = {("Amplitude-v0", "ppo/amplitude"): (15.0, 3.0), ("Amplitude-v1", "ppo/amplitude-v1"): (30.0, 6.0)}
+
+#: Number of many environments.
 MANY = 1024
 
 #: Samples before timing, so that observations are from the middle of an episode.
@@ -32,7 +34,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 
 def _decisions(track: str, name: str, count: int) -> Callable[[int], tuple[float, float]]:
-    """Decisions for a number of environments that are not stepped meanwhile."""
+    """Time decisions for a number of environments at one observation."""
     envs = gym.make_vec(f"duffing_env/{track}", num_envs=count, vectorization_mode="vector_entry_point")
     policy = make_policy(name, envs)
     observations, _ = envs.reset(seed=0)

@@ -20,15 +20,31 @@ from benchmarks.timed_rounds import Row, later, measure, timed
 from estimator.compilation.simd import LANES
 from estimator.support.update_options import DEFAULT_ITERATIONS
 
+#: Tracks of Eq. (2) and of Eq. (1).
 TRACK, CONTINUOUS = "duffing_env/Amplitude-v0", "duffing_env/Amplitude-v1"
+
+#: Unit of the rows.
 UNIT = "env-steps/s"
+
+#: Environments side by side.
 SIZES = (1, 8, 64, 1024, 16384)
+
+#: The same for Gymnasium's SyncVectorEnv.
 SYNC_SIZES = (1, 8, 64, 1024)
+
+#: Samples of an episode.
 EPISODES = {TRACK: 256, CONTINUOUS: 256, "Pendulum-v1": 200, "CartPole-v1": 200}
+
+#: Threads of torch for a policy.
 POLICY_THREADS = 2
+
+#: Samples of random actions; they repeat.
 DRAWN_ACTIONS = 64
+
+#: Number of environments of the ratios with a bar.
 TARGET_SIZE = 1024
-#: Eq. (1) as Eq. (2) has it on its tracks: with noises that are known.
+
+#: Options of known noises on a track of Eq. (1).
 KNOWN: dict[str, Any] = {"noise_range": 1.0, "noise_hypotheses": 1}
 
 

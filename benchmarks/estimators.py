@@ -15,15 +15,24 @@ from estimator.belief import Belief
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
+#: Samples of the record.
 SAMPLES = 4096
+
+#: Unit of the rows.
 UNIT = "µs/sample"
+
+#: Names of our rows.
 STRUCTURED, MEAN_FIELD = "ours, structured, 3 iterations", "ours, mean field, 10 iterations"
+
+#: Model and longest time of a sample [µs] of the rows that call ``update``.
 ONE_BY_ONE = {"ours, update(u, y), Eq. (2)": (difference(), 10), "ours, update(u, y), Eq. (1)": (duffing(), 15)}
+
+#: Names of the rows of other packages.
 PEERS = {"filterpy": "filterpy, UKF", "dynamax": "dynamax, EKF, compiled scan", "padasip": "padasip, RLS"}
 
 
 def samples() -> tuple[FloatArray, FloatArray, str]:
-    """Input and output [V], and where they are from: the record's multisine, or the twin under a synthesised one."""
+    """Input and output [V] and their origin: the record's multisine, or the twin under a synthesised one."""
     if record_available():
         regime = load_record().multisine
         return regime.u[:SAMPLES], regime.y[:SAMPLES], f"first {SAMPLES:,} samples of the record's multisine"
@@ -39,7 +48,7 @@ def samples() -> tuple[FloatArray, FloatArray, str]:
 
 
 def write_samples(path: Path) -> None:
-    """What `benchmarks.silverbox_peer_filters` reads: the same samples, our prior, and its expected noises."""
+    """Write the input of `benchmarks.silverbox_peer_filters`: the same samples, our prior and its expected noises."""
     u, y, _ = samples()
     prior = silverbox_prior()
     gamma_shape, gamma_rate, xi_shape, xi_rate = prior.noises
@@ -59,7 +68,7 @@ def write_samples(path: Path) -> None:
 
 
 def run(peers: Peers, repetitions: int, on_row: Callable[[str], None]) -> Section:
-    """Time the estimators, and give the error that each one's coefficients make, so that speed is bought knowingly."""
+    """Time the estimators, and compute the errors of their coefficients: speed alone says little."""
     u, y, origin = samples()
     coefficients: dict[str, Any] = {}
     rows = [
@@ -105,7 +114,7 @@ def _passes(
 
 
 def _updates(model: Model, u: FloatArray, y: FloatArray) -> Callable[[int], float]:
-    """One estimator, called from Python for every sample."""
+    """Time one estimator, called from Python for every sample."""
     estimator, pairs = OnlineEstimator(model), list(zip(u.tolist(), y.tolist(), strict=True))
 
     def action(count: int) -> float:
@@ -118,7 +127,7 @@ def _updates(model: Model, u: FloatArray, y: FloatArray) -> Callable[[int], floa
 
 
 def _errors(coefficients: FloatArray, u: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """RMSE [mV] one step ahead, and in a free run."""
+    """RMSE one step ahead and in a free run [mV]."""
     prior = silverbox_prior()
     record = prior.record.copy()
     record[2:6] = coefficients

@@ -1,4 +1,4 @@
-"""Coverage of credible intervals: how often the posterior's 90 % intervals contain the truth, over the prior's systems.
+"""Coverage of credible intervals: how often the posterior's 90 % intervals hold the truth, over systems of the prior.
 
 ``python -m benchmarks.interval_coverage`` prints the tables of docs/evidence/coverage.md, continuous.md and
 expectations.md.
@@ -28,29 +28,46 @@ LEVEL = 0.90
 #: Half width of the intervals, in standard deviations.
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))
 
-#: Shape of the noises' Gamma priors: weak.
+#: Shape of the Gamma priors of the noise precisions: a weak prior.
 NOISE_SHAPE = 2.0
 
-#: Noise ratios of an ensemble.
+#: Noise ratios in an ensemble.
 HYPOTHESES = 9
 
+#: Standard deviations of process and measurement noise [V].
 NOISES = ((2e-3, 1e-3), (2e-3, 1e-4), (5e-4, 5e-4), (1e-4, 3e-4))
+
+#: Lengths of records [samples].
 LENGTHS = (256, 2048)
-# Where tables centre the noise priors wrongly: at these multiples of the true process and measurement noise, or both at
-# one value.
+
+#: Centres of wrong noise priors, as multiples of the true process and measurement noise.
 FACTORS = ((3.0, 3.0), (1 / 3, 1 / 3), (2.0, 1 / 4))
-EQUAL_CENTER = 5e-4  # V
 
-#: Of the population ``wide``, with the centres of the measurement noise's prior and the spreads of its tables.
-WIDE_NOISES, WIDE_CENTERS, WIDE_SPREADS = (5e-6, 3e-4), (3e-4, 1e-3), (0.3, 0.1)
+#: Centre of wrong priors of both noises [V].
+EQUAL_CENTER = 5e-4
 
-#: Estimators of the environment whose plants are the population ``track``.
-TRACK, TRACK_ESTIMATORS, NO_LIMIT = "duffing_env/Amplitude-v1", ("ode", "nlarx"), 1e3
+#: Process and measurement noise of the population ``wide`` [V].
+WIDE_NOISES = (5e-6, 3e-4)
+
+#: Centres of its prior of the measurement noise [V].
+WIDE_CENTERS = (3e-4, 1e-3)
+
+#: Its relative spreads.
+WIDE_SPREADS = (0.3, 0.1)
+
+#: Environment whose plants are the population ``track``.
+TRACK = "duffing_env/Amplitude-v1"
+
+#: Its estimators.
+TRACK_ESTIMATORS = ("ode", "nlarx")
+
+#: Limit of its output that no plant reaches [V].
+NO_LIMIT = 1e3
 
 
 @dataclass(frozen=True)
 class Case:
-    """What one row of a table tests.
+    """Settings of one row of a table.
 
     Attributes:
         process_noise: standard deviation of w̃ on the displacement [V].
@@ -79,18 +96,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What came out.
+    """Results of one row.
 
     Attributes:
-        kept: systems whose displacement stayed in range; the others are left out.
-        hits: of the kept, those whose interval holds the truth, for each coefficient that has one; and for m, c, a and
-            b of ``paper`` and of ``track``.
+        kept: number of systems whose displacement stayed in range; the others do not count.
+        hits: number of kept systems whose interval holds the truth, by coefficient; for ``paper`` and ``track`` also
+            by physical parameter m, c, a, b.
         nees: mean over systems of dᵀ P⁻¹ d / K with d the error of the K coefficients (of ``track``: of m, c, a, b) and
             P its posterior covariance; 1 where the posterior is calibrated.
         nees_quantiles: its median, its 99 % quantile and its largest value.
         gamma, xi: 5 % quantile, median and 95 % quantile of E[γ] and of E[ξ], divided by the true precision.
-        ratio_std: median standard deviation of log(σ_w/σ_v), for an ensemble.
-        error: median of |estimate / truth - 1| of m, c, a and b, where these are known.
+        ratio_std: median standard deviation of log(σ_w/σ_v); None without an ensemble.
+        error: median of |estimate / truth - 1|, by physical parameter; empty where the truth has none.
     """
 
     kept: int
@@ -105,14 +122,14 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Config:
-    """Coverage of the 90 % intervals."""
+    """Tables of the coverage of 90 % intervals."""
 
     systems: int = 500
-    """Oscillators simulated for each row."""
+    """Number of systems of each row."""
     only: tuple[str, ...] = ("",)
-    """Beginnings of the titles of the tables to make; all without."""
+    """Beginnings of the titles of the tables to make; all tables by default."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     json: Path | None = None
     """File for the results."""
 
@@ -131,25 +148,25 @@ def tables() -> dict[str, list[Case]]:
     wrong[f"noise priors centred at {EQUAL_CENTER:g} V"] = [
         Case(w, v, samples, equal) for w, v, samples in settings if (w, v) != equal
     ]
-    made = {
+    chosen = {
         "structured": right,
         "mean field": _with(right, factorisation="mean_field"),
         **{name: _with(right, population=name) for name in ("offset", "three-tap", "cubic", "ode")},
         "ensemble": _with(right, hypotheses=HYPOTHESES),
     }
     for title, cases in wrong.items():
-        made[f"structured, {title}"] = cases
-        made[f"ensemble, {title}"] = _with(cases, hypotheses=HYPOTHESES)
+        chosen[f"structured, {title}"] = cases
+        chosen[f"ensemble, {title}"] = _with(cases, hypotheses=HYPOTHESES)
     for name in TRACK_ESTIMATORS:
-        made[f"track, {name}"] = _with(right, population="track", estimator=name)
+        chosen[f"track, {name}"] = _with(right, population="track", estimator=name)
     for spread in WIDE_SPREADS:
         for center in WIDE_CENTERS:
-            made[f"wide, prior of {100 * spread:g} %, noise prior centred at {1e3 * center:g} mV"] = [
+            chosen[f"wide, prior of {100 * spread:g} %, noise prior centred at {1e3 * center:g} mV"] = [
                 Case(*WIDE_NOISES, samples, (WIDE_NOISES[0], center), "wide", spread, expectations=expectations)
                 for samples in LENGTHS
                 for expectations in EXPECTATIONS
             ]
-    return made
+    return chosen
 
 
 def _with(cases: list[Case], **changes: Any) -> list[Case]:
@@ -186,12 +203,12 @@ def evaluate(case: Case, systems: int, seed: int) -> Coverage:
     )
 
 
-#: Beliefs, the true coefficients and the true m, c, a, b by name, and the spreads of an ensemble's ratios.
+#: Beliefs, true coefficients and true m, c, a, b by name, and standard deviations of log(σ_w/σ_v) of an ensemble.
 Identified = tuple[list[Belief], dict[str, FloatArray], dict[str, FloatArray], list[float]]
 
 
 def _identify(case: Case, systems: int, seed: int) -> Identified:
-    """Identify simulated systems, each by itself."""
+    """Draw systems of a population, and identify each from its record."""
     noises = case.process_noise, case.measurement_noise
     rng = np.random.default_rng([seed, NOISES.index(noises) if noises in NOISES else len(NOISES), case.samples])
     drawn = draw(case.population, systems, *noises, case.samples, rng, case.spread)
@@ -213,7 +230,7 @@ def _identify(case: Case, systems: int, seed: int) -> Identified:
 
 
 def _identify_in_track(case: Case, systems: int, seed: int) -> Identified:
-    """Let the environment identify its own plants, from uniform inputs; the coefficients of ``nlarx`` have no truth."""
+    """Let the environment identify its plants under uniform inputs; coefficients of ``nlarx`` have no truth."""
     envs = gym.make_vec(
         TRACK, num_envs=systems, vectorization_mode="vector_entry_point", copy=False, estimator=case.estimator,
         process_noise=case.process_noise, measurement_noise=case.measurement_noise, horizon=case.samples,
@@ -234,10 +251,10 @@ def _identify_in_track(case: Case, systems: int, seed: int) -> Identified:
 
 
 def _judge(means: FloatArray, covs: FloatArray, truth: dict[str, FloatArray]) -> tuple[dict[str, int], FloatArray]:
-    """Intervals that hold the truth (N,), by name; and (N,) dᵀ P⁻¹ d / K, of means (N, K) and covariances (N, K, K)."""
+    """Intervals that hold the truth by name, and (N,) dᵀ P⁻¹ d / K, from means (N, K) and covs (N, K, K)."""
     std = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
     errors = (np.column_stack(list(truth.values())) - means) / std
-    units = covs / (std[:, :, None] * std[:, None, :])  # better conditioned, because scales are up to ten orders apart
+    units = covs / (std[:, :, None] * std[:, None, :])  # well conditioned: the scales of P are up to ten orders apart
     nees = np.einsum("ni,ni->n", errors, np.linalg.solve(units, errors[..., None])[..., 0]) / len(truth)
     return dict(zip(truth, (np.abs(errors) <= QUANTILE).sum(axis=0).tolist(), strict=True)), nees
 
@@ -248,13 +265,13 @@ def _quantiles(values: Any, low: float, middle: float, high: float) -> tuple[flo
 
 
 def wilson(hits: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a proportion, of which ``hits`` of ``trials`` were seen."""
+    """Wilson's 95 % interval of a proportion with ``hits`` in ``trials``."""
     interval = binomtest(hits, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
 
 def cells(case: Case, found: Coverage) -> dict[str, str]:
-    """A row of a table, by the titles of its columns."""
+    """Cells of a row by the titles of their columns."""
     row = {"σ_w [V]": f"{case.process_noise:g}", "σ_v [V]": f"{case.measurement_noise:g}", "T": str(case.samples)}
     if case.population == "wide":
         row = {"expectations": case.expectations, "T": str(case.samples)}
@@ -270,18 +287,19 @@ def cells(case: Case, found: Coverage) -> dict[str, str]:
 
 
 def noise_cells(case: Case, found: Coverage) -> tuple[str, ...]:
-    """A row of an ensemble's table of noises."""
+    """Cells of a row in an ensemble's table of noises."""
     (low, gamma, high), (least, xi, most) = found.gamma, found.xi
     noises = (f"{value:.2g}" for value in (gamma, low, high, xi, least, most))
     return (f"{case.process_noise:g}", f"{case.measurement_noise:g}", str(case.samples), *noises,
             f"{found.ratio_std:.2f}")  # fmt: skip
 
 
+#: Titles of an ensemble's table of noises.
 _NOISES = ("σ_w [V]", "σ_v [V]", "T", "E[γ]/γ", "5 %", "95 %", "E[ξ]/ξ", "5 %", "95 %", "std of log(σ_w/σ_v)")
 
 
 def main(config: Config) -> None:
-    """Evaluate the tables, print each, and write all where a file is named, with Wilson's 95 % intervals."""
+    """Evaluate and print the tables; write them into the file, if one is given, with Wilson's 95 % intervals."""
     from rich.progress import track
 
     results = {}

@@ -24,12 +24,19 @@ import numpy as np
 
 Run = Callable[[int], dict[str, Any]]
 
+#: Packages whose versions are printed.
 PACKAGES = (
     *("envpool", "gymnax", "jax", "jaxlib", "gymnasium", "filterpy", "dynamax", "padasip", "fastcan", "scikit-learn"),
     *("pysindy", "numpy", "scipy"),
 )
+
+#: Samples of an episode.
 EPISODE = 200
+
+#: Threads of EnvPool.
 POOL_THREADS = 2
+
+#: Samples of random actions; they repeat.
 DRAWN_ACTIONS = 64
 
 

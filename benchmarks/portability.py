@@ -1,4 +1,4 @@
-"""Runs the numerical tests under several instruction sets of one machine: `make portability`.
+"""Run the numerical tests under several instruction sets of one machine: `make portability`.
 
 The processor decides how a sum is grouped, whether a product is rounded before it is added, and which polynomial
 computes a tanh. Settings of the libraries do so too, and let one machine compute as others would. A test that fails
@@ -21,7 +21,7 @@ from benchmarks.__main__ import cpuinfo, describe_machine
 
 ROOT = Path(__file__).parents[1]
 
-#: What Numba compiles, beside its twins.
+#: Tests that compare code compiled by Numba with NumPy.
 COMPILED = (
     "tests/estimator",
     "tests/duffing_env/test_continuous_plant.py",
@@ -37,14 +37,14 @@ COMPILED = (
     "tests/research/benchmarks/test_roofline.py",
     "tests/research/benchmarks/test_pieces.py",
 )
-#: Networks, beside torch's.
+#: Tests that compare networks with torch's.
 NETWORKS = (
     "tests/agents/test_evaluation.py",
     "tests/agents/test_rollout_features.py",
     "tests/agents/test_trained_policy.py",
     "tests/agents/test_sb3_vec_env.py",
 )
-#: What NumPy and SciPy compute.
+#: Tests of code on NumPy and SciPy.
 ARRAYS = (
     "tests/estimator",
     "tests/duffing_env/test_silverbox.py",
@@ -56,7 +56,7 @@ ARRAYS = (
 
 @dataclass(frozen=True)
 class Setting:
-    """Variables that choose instructions.
+    """Environment variables that choose instructions.
 
     Attributes:
         name: in the table.
@@ -76,7 +76,7 @@ _HASWELL = ("avx2", "fma", "bmi2")
 
 
 def settings() -> Iterator[Setting]:
-    """All that are tried."""
+    """All settings."""
     # With a name alone, Numba would add the features of the machine to it.
     numba = {name: {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""} for name in ("generic", "haswell")}
     numba["skylake-avx512"] = {"NUMBA_CPU_NAME": "skylake-avx512", "NUMBA_CPU_FEATURES": ""}
@@ -104,7 +104,7 @@ def settings() -> Iterator[Setting]:
 
 
 def _numpy_features() -> list[str]:
-    """What NumPy has code for beyond its baseline and finds on this machine; its names change with its versions."""
+    """Instruction sets beyond NumPy's baseline that it uses on this machine; the names change with its versions."""
     from numpy._core import _multiarray_umath as found  # type: ignore[attr-defined]
 
     return [name for name in found.__cpu_dispatch__ if found.__cpu_features__[name]]
@@ -117,7 +117,7 @@ def processor_features() -> set[str]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How many tests passed and failed, by name, and the time that they took [s]."""
+    """Number of passed tests, names of failed ones, and their time [s]."""
 
     passed: int
     failed: tuple[str, ...]
@@ -125,10 +125,10 @@ class Outcome:
 
 
 def run(setting: Setting, workers: int, caches: Path) -> Outcome:
-    """Run the part of a setting under it.
+    """Run the tests of a setting under it.
 
     Raises:
-        OSError: if the tests did not start; what they said is printed.
+        OSError: if the tests did not start; the message has their output.
     """
     # Kernels depend on Numba's setting alone: all other settings share one cache.
     cache = caches / setting.variables.get("NUMBA_CPU_NAME", "host")
@@ -163,12 +163,12 @@ def read_report(path: Path, seconds: float) -> Outcome:
 
 @dataclass(frozen=True)
 class Config:
-    """The tests that compute, under several instruction sets of this machine; exit status 1 if one fails."""
+    """Numerical tests under several instruction sets of this machine; exit status 1 if one fails."""
 
     only: tuple[str, ...] = ()
-    """Settings to run, by words of their names; all if none is given."""
+    """Words of the names of settings to run; none stands for all."""
     workers: int = 2
-    """Processes that run them."""
+    """Number of processes."""
 
 
 def main(config: Config) -> None:

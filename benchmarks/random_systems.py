@@ -1,10 +1,9 @@
-"""Random systems for the coverage tables: drawn and simulated, with the prior that has the moments of the draw.
+"""Random systems for the coverage tables: drawn and simulated, with a prior that has the moments of the draw.
 
 Every population has the four parameters of an oscillator near the twin of the Silverbox; further parameters are
-Gaussian about 0. The difference equations start at rest, under independent uniform inputs. ``ode`` has such inputs too,
-but its initial state separates its offsets, and is therefore drawn from the prior. ``wide`` is the same equation under
-a Gaussian prior that is wide beside the information of a sample, under three times the multisine of the Silverbox, from
-rest.
+Gaussian about 0. The difference equations start at rest, under independent uniform inputs. ``ode`` has the same inputs;
+its initial state, which separates its offsets, is drawn from the prior. ``wide`` is the equation of ``ode`` from rest,
+under three times the multisine of the Silverbox, with a Gaussian prior that is wide beside a sample's information.
 """
 
 from collections.abc import Mapping
@@ -30,25 +29,42 @@ from estimator.models.expression import evaluate, parse
 from estimator.priors import log_uniform_moments
 from estimator.support.array_types import FloatArray
 
+#: Names of the populations.
 POPULATIONS = ("paper", "offset", "three-tap", "cubic", "ode", "wide")
 
-SPREAD = 0.3  # of the four: log-uniform on the twin's value * [1 - SPREAD, 1 + SPREAD]; of ``wide`` the deviation
-MAX_INPUT = 0.15  # V; inputs are independent and uniform on ± this
-MAX_DISPLACEMENT = 0.75  # V; above it the difference equations blow up, where the circuit does not
-STATE_STD = 1e-3  # V, and V per sample; of the state's prior
+#: Relative spread of the four parameters: log-uniform on the twin's value * [1 - SPREAD, 1 + SPREAD]. In ``wide`` it is
+#: their relative standard deviation.
+SPREAD = 0.3
+
+#: Inputs are uniform on ± this [V].
+MAX_INPUT = 0.15
+
+#: Displacement beyond which a system is dropped [V]: the difference equations diverge there, the circuit does not.
+MAX_DISPLACEMENT = 0.75
+
+#: Standard deviation of the states' prior [V, and V per sample].
+STATE_STD = 1e-3
 
 #: Standard deviations of the coefficients that Eq. (2) does not have, by unit.
 _OTHERS = {"V": 2e-3, "1": 0.05}
+
+#: Standard deviation of coefficients of products [V⁻¹, V⁻²].
 _PRODUCT = 0.1
 
-#: The physical equation of the tables: its noise is an acceleration held over a sample.
+#: Physical equation of the tables; its process noise is an acceleration held over a sample.
 ODE = duffing(offsets=True, feedthrough=True, noise="held")
 
-#: What varies of it by the spread, in the order of the draws; and the deviations of u0, y0 and d.
-_DRAWN, _OFFSETS = ("stiffness", "damping", "gain", "cubic"), (0.02, 0.02, 0.1)
+#: Its coefficients that vary by the spread, in the order of the draws.
+_DRAWN = ("stiffness", "damping", "gain", "cubic")
 
-#: Of ``wide``: parts of their means below which the four are drawn again, and of the Silverbox's excitation.
-_LEAST, _AMPLIFICATION = 0.1, 3
+#: Standard deviations of u0 [V], y0 [V] and d.
+_OFFSETS = (0.02, 0.02, 0.1)
+
+#: In ``wide``, coefficients below this part of their mean are drawn again.
+_LEAST = 0.1
+
+#: In ``wide``, the input over the Silverbox's.
+_AMPLIFICATION = 3
 
 
 @dataclass(frozen=True)
@@ -76,7 +92,7 @@ def make_model(population: str) -> Model:
 
 
 def make_rig(population: str) -> Rig:
-    """How its inputs act: the newest tap with the output of its own index; of the physical equation linearly."""
+    """The rig of a population: how the input acts within a sample, and its delay."""
     if make_model(population).is_continuous:
         return Rig.silverbox("linear")
     return Rig.silverbox("zero_order", int(population == "offset"))

@@ -1,4 +1,4 @@
-"""Trains five seeds on a Ray cluster of two nodes, kills one node in mid-training, and compares with runs without Ray.
+"""Train five seeds on a Ray cluster of two nodes, kill one node in mid-training, and compare with runs without Ray.
 
 $ python -m benchmarks.ray_node_kill
 
@@ -23,16 +23,19 @@ from estimator.support.optional_dependencies import require_packages
 
 ROOT = Path(__file__).parents[1]
 
+#: Trainings, samples and checkpoints of each, and samples of a roll-out.
 SEEDS, STEPS, CHECKPOINTS, ROLLOUT = 5, 40_960, 8, 1_024
+
+#: Samples between checkpoints.
 INTERVAL = STEPS // CHECKPOINTS
 
-#: A recipe that takes a while: many gradient steps for few samples.
+#: Options of a slow training: many gradient steps for few samples.
 WORDS = (
     "--env", "duffing_env/Short-v0", "--steps", str(STEPS), "--checkpoints", str(CHECKPOINTS), "--seeds", str(SEEDS),
     "--systems", "0", "--ppo.num-envs", "64", "--ppo.n-steps", "16", "--ppo.batch-size", "64", "--ppo.n-epochs", "10",
 )  # fmt: skip
 
-#: An hour is more than any of it takes, on whatever machine.
+#: Longest wait [s]; more than any step takes.
 LONGEST = 3600.0
 
 
@@ -44,22 +47,22 @@ def begin(output: Path, *words: str, **environment: str) -> subprocess.Popen:
 
 
 def children(pid: int) -> list[int]:
-    """The processes that a process has begun, and not those that these have."""
+    """Direct child processes of a process."""
     lists = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
     return [int(child) for each in lists for child in each]
 
 
 def at_work(pids: list[int], output: Path) -> set[int]:
-    """The seeds whose log one of the processes is writing."""
+    """Seeds whose log one of the processes has open."""
     places = set()
     for file in (file for pid in pids for file in Path(f"/proc/{pid}/fd").glob("*")):
-        with suppress(OSError):  # of one that has been closed since
+        with suppress(OSError):  # a file may be closed meanwhile
             places.add(file.readlink())
     return {seed for seed in range(SEEDS) if output / str(seed) / "progress.csv" in places}
 
 
 def rows(run: Path) -> list[dict[str, str]]:
-    """The log of a run: a row for each roll-out."""
+    """Rows of a run's log, one for each roll-out."""
     return [row for row in csv.DictReader((run / "progress.csv").read_text().splitlines()) if None not in row.values()]
 
 
@@ -69,7 +72,7 @@ def steps_of(row: dict[str, str]) -> int:
 
 
 def begun_at(run: Path) -> list[int]:
-    """Samples from which each attempt continued: the first row of an attempt has no update."""
+    """Samples at which each attempt began: the first row of an attempt has no update."""
     return [steps_of(row) - ROLLOUT for row in rows(run) if not row["train/n_updates"]]
 
 
@@ -80,7 +83,7 @@ def is_midway(run: Path) -> bool:
 
 
 def kill_in_training(node: object, output: Path) -> dict[int, int]:
-    """Kill a node's processes when all its seeds are midway; its seeds, to the samples that they had by then."""
+    """Kill a node's processes when all its seeds are midway; return the samples of each seed until then."""
     (raylet,) = (info.process.pid for info in node.all_processes["raylet"])
     ends = time.monotonic() + LONGEST
     while time.monotonic() < ends:
@@ -96,13 +99,13 @@ def kill_in_training(node: object, output: Path) -> dict[int, int]:
 
 
 def signal_all(pids: list[int], signal: int) -> None:
-    """Send a signal to each of some processes."""
+    """Send a signal to processes."""
     for pid in pids:
         os.kill(pid, signal)
 
 
 def main() -> int:
-    """Print the table; the number of seeds that are not as they should be."""
+    """Print the table; return the number of failed seeds."""
     require_packages("ray")
     from ray.cluster_utils import Cluster
 

@@ -1,4 +1,4 @@
-"""Compares the numbers of two versions of this project: ``python -m benchmarks.regression --commit REV``.
+"""Compare the numbers of two versions of this project: ``python -m benchmarks.regression --commit REV``.
 
 It compares episodes of every track, `identify` on every shipped rig, decisions of ``efe`` and of every shipped policy,
 and ``reproduce.py``, number by number. Each version runs in its own tree and process.
@@ -37,7 +37,7 @@ def results_of(tree: Path, archive: Path) -> dict[str, Any]:
 
 
 def difference(old: Any, new: Any) -> float:
-    """The largest difference relative to the largest number: 0 where every bit is the same."""
+    """The largest difference over the largest old number; 0 for equal bits, infinity for another shape or type."""
     if old.shape != new.shape or old.dtype != new.dtype:
         return np.inf
     if old.tobytes() == new.tobytes():

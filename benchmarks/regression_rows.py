@@ -1,4 +1,4 @@
-"""Writes the results of one version of this project into an archive of arrays, as a child of `benchmarks.regression`.
+"""Write the results of one version of this project into an archive of arrays, as a child of `benchmarks.regression`.
 
 It runs in that version's tree, so it uses only public names that every version has.
 """
@@ -54,7 +54,7 @@ def episodes(track: str) -> dict[str, Any]:
 
 
 def record_of(rig: Rig) -> tuple[Any, Any]:
-    """An input (600,) and the output (600,) of a rig in its own units, by small explicit steps of its guess."""
+    """Simulate an input (600,) and the output (600,) of a rig in its units, by small explicit steps of its guess."""
     rng = np.random.default_rng(3)
     middle = {name: float(np.mean(interval)) for name, interval in (rig.guess or {}).items()}
     m, c, a, b = (middle.get(name, default) for name, default in zip("mcab", (1.7e-5, 2.8e-4, 1.0, 4.0), strict=True))
@@ -72,7 +72,7 @@ def record_of(rig: Rig) -> tuple[Any, Any]:
 
 
 def identified(name: str) -> dict[str, Any]:
-    """What `identify` says of a record of a shipped rig: every parameter, its deviation, and the warnings."""
+    """Results of `identify` on a record of a shipped rig: every parameter, its standard deviation, and the warnings."""
     rig = Rig.silverbox("zero_order", 0) if name == "silverbox" else Rig.shipped(name)
     result = identify(rig, record_of(rig))
     return {
@@ -83,7 +83,7 @@ def identified(name: str) -> dict[str, Any]:
 
 
 def decisions(policy: str, track: str) -> dict[str, Any]:
-    """The actions of a policy, and the rewards that follow."""
+    """Actions of a policy, and their rewards."""
     envs: Any = gym.make_vec(track, SIZE, vectorization_mode="vector_entry_point")
     chooser = make_policy(policy, envs, seed=0)
     observations, _ = envs.reset(seed=4)
@@ -118,7 +118,7 @@ def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def card_track(policy: str) -> str:
-    """The track that a shipped policy was trained on."""
+    """Track of a shipped policy's training."""
     from agents.policies import TRAINED
 
     track = json.loads((TRAINED / policy / "policy.json").read_text())["config"]["env"]
@@ -126,7 +126,7 @@ def card_track(policy: str) -> str:
 
 
 def main(tree: Path, archive: Path) -> None:
-    """Compute every row and write it."""
+    """Compute all rows and write them."""
     rows: dict[str, dict[str, Any]] = {}
 
     def add(name: str, values: dict[str, Any]) -> None:

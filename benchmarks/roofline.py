@@ -1,11 +1,10 @@
-"""Section 4a: roofline of the compiled step: its share of this processor's peak, and the operations that take the time.
+"""Section 4a: roofline of the compiled step: its share of this processor's peak, and the time of its operations.
 
-The yardsticks are compiled as the step is (`estimator.compilation.simd.lanewise`): multiply-adds, divisions, square
-roots and copies on independent values that stay in the nearest cache. Everything here runs on one thread.
+The yardsticks are compiled like the step (`estimator.compilation.simd.lanewise`): multiply-adds, divisions, square
+roots and copies on independent values that stay in the nearest cache. All runs on one thread.
 
-Operations are counted in the code that `estimator.compilation.scalar_jit` gives to LLVM, once for every lane. The
-compiler still merges an expression or two that are written twice; the assembly has the same number of divisions and
-roots.
+Operations are counted in the code that `estimator.compilation.scalar_jit` gives to LLVM, once for every lane. LLVM
+merges a few equal expressions; the assembly has the same number of divisions and roots.
 """
 
 import re
@@ -29,13 +28,21 @@ from estimator.compilation.scalar_jit import scalar_jit
 from estimator.compilation.simd import LANES, jit, lanewise, number_rows
 from estimator.inference import mean_field
 
+#: Environments side by side.
 SIZE = 1024
+
+#: Samples of an episode.
 STEPS = 256
+
+#: Calls of a yardstick in one timed unit.
 REPEATS = 1000
+
+#: Share of the multiply-add peak to reach [%].
 TARGET_SHARE = 30.0
 
+#: Name of the inference of each factorisation.
 _INFERENCE = {"structured": "inference, structured", "mean_field": "inference, mean field"}
-# The pieces of a step, and in whose step each is timed.
+#: Pieces of a step, and the factorisation of the step in which each is timed.
 _PIECES = {
     "noise": "structured",
     "plant": "structured",
@@ -43,9 +50,14 @@ _PIECES = {
     "reward and end": "structured",
     "observation": "structured",
 }
+
+#: Name of the whole step of each factorisation.
 _STEPS = {"structured": "whole step, structured", "mean_field": "whole step, mean field"}
 
+#: Rows of a yardstick's block.
 _YARDSTICK = number_rows("a b c d")
+
+#: Names of the yardsticks.
 _FUSED = "multiply-adds, one thread"
 _DIVISIONS = "divisions, one thread"
 _ROOTS = "square roots, one thread"
@@ -65,7 +77,7 @@ def _sixteen(value, x, y):
     return _four(_four(_four(_four(value, x, y), x, y), x, y), x, y)
 
 
-# 4 rows of LANES values are 16 independent vectors with AVX-512, 32 with AVX2: enough to hide an operation's latency.
+# Four rows of LANES values are 16 independent vectors with AVX-512 and 32 with AVX2, enough to hide the latency.
 @lanewise(_YARDSTICK, "a b c d", uniform="x y")
 def multiply_add(a, b, c, d, x, y):
     """64 fused multiply-adds per lane, in four independent chains."""
@@ -86,11 +98,11 @@ def take_root(a, b, c, d):
 
 @lanewise(_YARDSTICK, "a b c d", uniform="x")
 def move(a, b, c, d, x):
-    """4 loads and 4 stores per lane, and an addition each, without which the compiler would leave them out."""
+    """4 loads and 4 stores per lane, each with an addition: the compiler would remove bare copies."""
     return b + x, c + x, d + x, a + x
 
 
-#: What each yardstick measures: its function, and what it counts as work.
+#: Function of each yardstick, and the operation that it counts.
 _YARDSTICKS = {
     _FUSED: (multiply_add, "flop"),
     _DIVISIONS: (divide, "division"),
@@ -98,10 +110,10 @@ _YARDSTICKS = {
     _STORES: (move, "store"),
 }
 
-#: Arguments of lane functions that are blocks: the block of the systems, and the block of the results beside it.
+#: Arguments of lane functions that are blocks: the systems', and the results' beside it.
 _BLOCKS = ("W", "B")
 
-#: An instruction of LLVM's to what it is counted as.
+#: Operations that an instruction of LLVM counts as.
 _INSTRUCTIONS = {
     r"= f(?:add|sub|mul) ": ("flop",),
     r"= fdiv ": ("flop", "division"),
@@ -111,9 +123,10 @@ _INSTRUCTIONS = {
 
 
 def count(functions: dict[Any, int]) -> Counter[str]:
-    """Operations per lane of lane functions that are each called so often: ``flop``, ``division``, ``root``, ``store``.
+    """Count operations per lane: ``flop``, which includes divisions and roots, ``division``, ``root``, ``store``.
 
-    Divisions and roots are among the ``flop``.
+    Args:
+        functions: lane functions, and the number of calls of each.
     """
     counted: Counter[str] = Counter()
     for function, times in functions.items():
@@ -126,7 +139,7 @@ def count(functions: dict[Any, int]) -> Counter[str]:
 
 
 def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
-    """The pieces of a step: lane functions, and how often a step calls them."""
+    """Lane functions of each piece of a step, and how often a step calls them."""
     experiment = experiment_of(factorisation)
     kind = experiment.kernel_spec
     code = generated_functions(kind)
@@ -145,7 +158,7 @@ def pieces(factorisation: str) -> dict[str, dict[Any, int]]:
 
 
 def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
-    """Time the step, its pieces and the yardsticks, and put the ones beside the others."""
+    """Time the step, its pieces and the yardsticks, and compare them."""
     found = {rule: pieces(rule) for rule in _STEPS}
     operations = {name: count(found[rule][name]) for name, rule in _PIECES.items()}
     for rule, name in _STEPS.items():
@@ -169,11 +182,11 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
     ]
     lines = [_account(name, counted, results) for name, counted in operations.items()]
     notes = [
-        f"Peak: {_FUSED}, {peak / 1e9:.3g} Gflop/s. Operations are counted in what is given to the compiler; a "
-        f"multiply-add is two. {SIZE} environments; steps that only start an episode take place, but do not count.",
-        "Account, ns per env-step: what the operations would take if nothing else had to be done, at the rates of the\n"
-        "yardsticks; `arithmetic` is additions and multiplications, as if each stood in a multiply-add. What a step\n"
-        "takes beyond its pieces is copying: beliefs that are kept, outcomes, observations.\n\n"
+        f"Peak: {_FUSED}, {peak / 1e9:.3g} Gflop/s. Operations are counted in the code given to the compiler; a "
+        f"multiply-add is two. {SIZE} environments; steps that only start an episode run but do not count.",
+        "Account, ns per env-step: time of the operations alone, at the rates of the yardsticks; `arithmetic` is\n"
+        "additions and multiplications, as if each stood in a multiply-add. The time of a step beyond its pieces is\n"
+        "copying: of beliefs, outcomes and observations.\n\n"
         f"{'':<28}{'flop':>7}{'div':>6}{'sqrt':>6}{'arithmetic':>12}{'div+sqrt':>10}{'stores':>8}{'sum':>8}"
         f"{'measured':>10}\n" + "\n".join(lines),
     ]
@@ -181,7 +194,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 
 def _account(name: str, counted: Counter[str], results: dict[str, Result]) -> str:
-    """One line: nanoseconds that each kind of operation needs, their sum, and the time that was measured."""
+    """One line: counts, the time of each kind of operation, their sum, and the measured time [ns]."""
     slow = counted["division"] + counted["root"]
     arithmetic = 1e9 * (counted["flop"] - slow) / results[_FUSED].median
     dividing = 1e9 * (counted["division"] / results[_DIVISIONS].median + counted["root"] / results[_ROOTS].median)
@@ -193,7 +206,7 @@ def _account(name: str, counted: Counter[str], results: dict[str, Result]) -> st
 
 
 def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float]:
-    """One block, again and again."""
+    """Time a yardstick on one block."""
     values, call = np.ones((1, len(_YARDSTICK) * LANES)), _calls({function: REPEATS})
 
     def action(count: int) -> float:
@@ -206,7 +219,7 @@ def _yardstick(function: Any, operations_per_lane: int) -> Callable[[int], float
 
 
 def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], float]:
-    """A piece of the step, repeated on blocks that lie in the nearer caches as in the step."""
+    """Time a piece of the step on all blocks, which lie in the same caches as in the step."""
     initial, call = plants(SIZE, factorisation), _calls(functions)
     blocks, beside = initial.copy(), np.zeros(initial.shape[1])
 
@@ -220,9 +233,9 @@ def _piece(functions: dict[Any, int], factorisation: str) -> Callable[[int], flo
 
 
 def _calls(functions: dict[Any, int]) -> Any:
-    """``call(blocks, beside)``: every lane function, so often on each block; what goes beside it, into one.
+    """Compile ``call(blocks, beside)``, which calls each lane function its number of times on every block.
 
-    Uniform arguments do not matter to the time.
+    All results beside a block go into ``beside``. Uniform arguments have any value: they do not change the time.
     """
     piece = _nothing
     for function, times in functions.items():
@@ -242,7 +255,7 @@ def _nothing(W, B):
 
 
 def _then(before: Any, function: Any, times: int) -> Any:
-    """What was to be done before, and then a lane function."""
+    """Compile a function that calls ``before``, then the lane function ``times`` times."""
     names = function.source.arguments
     uniform = (1e-3,) * sum(name not in _BLOCKS for name in names)
 
@@ -262,7 +275,7 @@ def _then(before: Any, function: Any, times: int) -> Any:
 
 
 def _steps(rule: str) -> Callable[[int], float]:
-    """The compiled step, without the Python around it."""
+    """Time the compiled step, without the Python around it."""
     batch = Batch(SimulatedExperiment(factorisation=rule), SIZE, RESET_NEXT_STEP)
     for row in range(SIZE):
         batch.seed(row, np.random.default_rng(row))

@@ -13,21 +13,29 @@ from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import CORES, Result, Row, later, measure, timed
 from estimator.support.update_options import DEFAULT_ITERATIONS
 
+#: Unit of the rows.
 UNIT = "ns/env-step"
+
+#: Environments, where these are not the axis.
 SIZE = 1024
+
+#: Samples of an episode, where these are not the axis.
 HORIZON = 256
-#: Option to what it is called, and its values.
+
+#: Label and values of each axis, by option.
 AXES: dict[str, tuple[str, Sequence[int]]] = {
     "num_envs": ("environments", (1, 4, 16, 64, 256, 1024, 4096, 16384)),
     "iterations": ("iterations", (1, 2, 3, 5, 10, 20)),
     "horizon": ("samples of an episode", (16, 64, 256, 1024)),
     "threads": ("threads", range(1, CORES + 1)),
 }
+
+#: Colour of each factorisation.
 _COLOURS = {"structured": "#0072b2", "mean_field": "#d55e00"}
 
 
 def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Section:
-    """Time whole steps through ``make_vec`` along each axis, others at their defaults, and draw the figure."""
+    """Time whole steps through ``make_vec`` along each axis, the others at their defaults, and draw the figure."""
     rows = [
         Row(_name(axis, value, rule), UNIT, later(partial(_steps, axis, value, rule)), at_least=0.1)
         for axis, (_, values) in AXES.items()
@@ -46,8 +54,8 @@ def run(repetitions: int, on_row: Callable[[str], None], figure: Path) -> Sectio
         )
     ]
     notes = [
-        f"Through make_vec; {SIZE} environments, one thread, {HORIZON} samples, 3 or 10 iterations, where an axis does "
-        "not say otherwise. The ends of episodes, where beliefs are handed out, are in."
+        f"Through make_vec; {SIZE} environments, one thread, {HORIZON} samples, 3 or 10 iterations, unless an axis "
+        "says otherwise. Ends of episodes, where beliefs are returned, are included."
     ]
     return Section("Scaling", list(results.values()), claims, notes)
 

@@ -1,4 +1,4 @@
-"""Tables of the benchmark's sections, printed and written: ratios first, then rows, then notes."""
+"""Tables of the benchmark's sections: ratios, then rows, then notes."""
 
 import math
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ from benchmarks.timed_rounds import Result
 
 @dataclass(frozen=True)
 class Claim:
-    """A ratio or a figure that a reader wants first, with the bar it is to clear where there is one.
+    """A ratio or a number that a reader wants first, with its bar if it has one.
 
     Attributes:
-        text: what it is.
-        value: NaN where what it is made from is not available.
-        bar: its target, if it has one.
-        at_most: whether the value is to stay below the bar.
-        unit: printed behind the value; ``×`` for ratios.
+        text: its name.
+        value: its value; NaN where a row that it needs is not available.
+        bar: the value to reach, or not to exceed.
+        at_most: whether the bar must not be exceeded.
+        unit: its unit; ``×`` for ratios.
     """
 
     text: str
@@ -28,7 +28,7 @@ class Claim:
 
     @property
     def verdict(self) -> str:
-        """PASS, MISS, ``not available``, or nothing without a bar."""
+        """PASS, MISS, ``not available``, or empty without a bar."""
         if math.isnan(self.value):
             return "not available"
         if self.bar is None:
@@ -42,7 +42,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the benchmark, finished."""
+    """Results of one section of the benchmark."""
 
     title: str
     results: Sequence[Result]
@@ -63,7 +63,7 @@ class Section:
 def ratio(over: Result, under: Result) -> float:
     """Ratio of medians, NaN where one is missing.
 
-    Medians, and not the median of per-round ratios: a round is too short for its rows to have met the same weather.
+    Medians, not the median of ratios of rounds: even within a round the machine's load changes.
     """
     return over.median / under.median
 
@@ -88,7 +88,7 @@ def print_section(section: Section) -> None:
 
 
 def print_verdicts(sections: Sequence[Section]) -> None:
-    """Print every claim that has a bar, once more, together."""
+    """Print all claims that have a bar."""
     print("\n== Targets\n")
     for section in sections:
         for claim in section.claims:

@@ -39,18 +39,22 @@ from research.studies.silverbox_protocol import (
 )
 from research.studies.silverbox_results import run_protocol, submission_line
 
+#: First samples of the training section, on which all online rows are timed.
 TIMED = 4096
-"""First samples of the training section, which all online rows are timed on."""
 
+#: Repetitions of each timing.
 REPETITIONS = 5
+
+#: Unit of the times.
 UNIT = "µs/sample"
 
+#: Smallest ratio of dynamax's time per sample to ours with the same model.
 BAR = 5.0
-"""Ours is to be this many times as fast per sample as dynamax's filter with the same model."""
 
+#: Our setting, by the name in a request.
 MODELS = {"ode": "ODE linear", "three-tap": "NLARX three-tap", "cubic": "NLARX cubic", "paper": "paper structured"}
-"""By the name that a request has: the setting of ours."""
 
+#: Package and model of the online peers, by the titles of their rows.
 PEERS = {
     "dynamax EKF, ODE linear": ("dynamax", "ode"),
     "dynamax EKF, three-tap": ("dynamax", "three-tap"),
@@ -59,15 +63,15 @@ PEERS = {
     "padasip RLS, three-tap": ("padasip", "three-tap"),
     "padasip RLS, cubic": ("padasip", "cubic"),
 }
-"""Online peers, by the titles of their rows."""
 
+#: Title of the row of the offline peer.
 OFFLINE = "fastcan NARX, offline"
 
+#: Places in our joint state of z, z', stiffness, damping, gain, cubic, force, y0 and d: the peers' order.
 _MOTION = [0, 1, 2, 4, 5, 3, 6, 7, 8]
-"""Places in our joint state of z, z', stiffness, damping, gain, cubic, force, y0 and d, which is the peers' order."""
 
+#: Effect on (z, z') of a force held over a sample, in proportion, without spring and damper, which ours includes.
 _DIRECTION = np.array([1.0, 2.0])
-"""What a force that is held over a sample does to (z, z'), but for spring and damper, which ours has as well."""
 
 
 @dataclass(frozen=True, eq=False)

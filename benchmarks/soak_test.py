@@ -30,20 +30,25 @@ from estimator.models.difference_equation import difference
 from estimator.models.duffing import duffing
 from estimator.support.progress import iterate_with_progress
 
+#: Environments side by side.
 _ROWS = 1024
 
-#: Extreme, but no kernel of their own.
+#: Extreme options that compile no further kernel.
 _EXTREME = {"max_input": 300.0, "max_output": 4000.0, "process_noise": 0.3, "noise_shape": 0.1}
 
+#: Columns of the table.
 COUNTED = ("samples", "episodes", "not finite", "out of bounds", "not a covariance", "growth")
 
-#: Models of the filters, with their default priors; and samples of the record.
+#: Models of the filters, which have their default priors.
 FILTERS: dict[str, Callable[[], Any]] = {"filter-paper": difference, "filter-duffing": duffing}
+
+#: Samples of a record that a filter processes at once.
 _PIECE = 16_384
 
 #: Samples of half a period of the tracks' middle oscillator.
 _HALF = 4
 
+#: Actions by name, from the sample's index and a generator.
 ACTIONS: dict[str, Callable[[int, np.random.Generator], Any]] = {
     "random": lambda t, rng: rng.uniform(-1, 1, (_ROWS, 1)),
     "constant": lambda t, rng: np.ones((_ROWS, 1)),

@@ -10,8 +10,13 @@ from benchmarks.peer_process import ROOT
 from benchmarks.section_tables import Claim, Section
 from benchmarks.timed_rounds import Row, measure
 
+#: Packages whose import is timed.
 PACKAGES = ("estimator", "duffing_env", "agents", "gymnasium", "numba", "stable_baselines3")
+
+#: Number of many environments.
 MANY = 16384
+
+#: Names of rows.
 FIRST_COLD, FIRST_WARM = "import and first step, nothing cached", "import and first step, cached"
 MEMORY, MEMORY_BARE = f"peak memory, {MANY:,} environments", "peak memory, 1 environment"
 
@@ -23,7 +28,7 @@ print(time.perf_counter() - started)
 print("torch" in sys.modules or "matplotlib" in sys.modules)
 """
 
-# A first step is all that is waited for: imports, make, reset and one step.
+# Time to a first step: imports, make, reset and one step.
 _FIRST_STEP = """
 import time
 started = time.perf_counter()
@@ -95,7 +100,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 
 def _script(text: str, cache: str) -> tuple[list[str], list[str]]:
-    """Run a script in a fresh Python; the words that it prints, and the lines that it says on stderr."""
+    """Run a script in a fresh Python; return the words of its stdout and the lines of its stderr."""
     done = subprocess.run(
         [sys.executable, "-c", text], cwd=ROOT, env={**os.environ, "NUMBA_CACHE_DIR": cache},
         capture_output=True, text=True,

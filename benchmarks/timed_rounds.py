@@ -1,4 +1,4 @@
-"""Times rows in rounds: all of them once, then all again, so that a busy moment of the machine affects all rows."""
+"""Time rows in rounds, every row once in each, so that a busy moment of the machine affects all of them."""
 
 import math
 import os
@@ -9,30 +9,31 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-#: That this process may use.
+#: Cores that this process may use.
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
-#: A row's run must last at least this long: the clock and a stray interrupt are then below a percent.
+#: Shortest run of a row [s]: the clock and an interrupt are then errors below a percent.
 LONG_ENOUGH = 0.25
 
-#: Pause before a run [s]: threads that wait for more work by spinning give up within milliseconds, and do not take the
-#: next row's cores.
+#: Pause before a run [s]: spinning threads of the row before stop within milliseconds and free the cores.
 SETTLING = 0.02
 
-#: From seconds and work to the value in a unit; where more is better, and where less is.
+#: Units of work per second.
 _RATES = ("env-steps/s", "flop/s", "op/s")
+
+#: Units of time or memory per work: factor from seconds, or MiB.
 _COSTS = {"ns/env-step": 1e9, "µs/sample": 1e6, "µs/decision": 1e6, "s": 1.0, "MiB": 1.0}
 
 
 @dataclass(frozen=True)
 class Row:
-    """Something to be timed.
+    """A row to time.
 
     Attributes:
-        name: unique within its section.
+        name: name, unique within its section.
         unit: ``env-steps/s`` and other rates are work per second; ``µs/sample`` and other costs seconds per work.
-        run: does ``count`` times the least it can do; returns seconds and work.
-        at_least: seconds that a run is made to last. 0: the row is neither warmed up nor repeated within a run.
+        run: does its smallest unit of work ``count`` times; returns seconds and work.
+        at_least: shortest run [s]; with 0 the row is neither warmed up nor repeated within a run.
     """
 
     name: str
@@ -46,10 +47,10 @@ class Result:
     """The times of a row.
 
     Attributes:
-        name: of the row.
-        unit: of the values.
-        values: one per repetition, in order; empty where the row could not run.
-        reason: why it could not.
+        name: name of the row.
+        unit: unit of the values.
+        values: one for each repetition, in order; empty where the row could not run.
+        reason: why the row could not run.
     """
 
     name: str
@@ -72,7 +73,7 @@ class Result:
 
 @dataclass
 class _Course:
-    """A row on its way through the repetitions."""
+    """A row and its values so far."""
 
     row: Row
     count: int = 1
@@ -85,10 +86,10 @@ def measure(
 ) -> dict[str, Result]:
     """Time rows in turns: warm all of them up, then ``repetitions`` rounds, each beginning at another row.
 
-    A row that raises is out, with the reason in its result; the others go on.
+    A row that raises an error is left out of further rounds, and its result has the reason.
 
     Args:
-        rows: what to time.
+        rows: rows to time.
         repetitions: rounds, at least 1.
         on_row: called with each row's name before its turn.
 
@@ -124,7 +125,7 @@ def _attempt(course: _Course, action: Callable[[_Course], None]) -> None:
 
 
 def _calibrate(course: _Course) -> None:
-    """The first run compiles; then lengthen the run until it lasts long enough."""
+    """Compile by a first run; then lengthen the run until it lasts long enough."""
     course.row.run(1)
     seconds, _ = course.row.run(1)
     while seconds < course.row.at_least:
@@ -138,7 +139,7 @@ def _run_once(course: _Course) -> None:
 
 
 def timed(action: Callable[[int], float]) -> Callable[[int], tuple[float, float]]:
-    """A row's ``run`` from a function that does the work and returns how much it was."""
+    """Make a row's ``run`` from a function that works and returns the amount of work."""
 
     def run(count: int) -> tuple[float, float]:
         started = time.perf_counter()
@@ -149,6 +150,6 @@ def timed(action: Callable[[int], float]) -> Callable[[int], tuple[float, float]
 
 
 def later(make: Callable[[], Callable[[int], Any]]) -> Callable[[int], Any]:
-    """A row's ``run``, or what `timed` takes, that is set up when it is first called."""
+    """Make a row's ``run``, or an argument of `timed`, whose set-up runs at its first call."""
     made = cache(make)
     return lambda count: made()(count)

@@ -22,14 +22,31 @@ from benchmarks.peer_process import ROOT
 from benchmarks.section_tables import Claim, Section, ratio
 from benchmarks.timed_rounds import CORES, Row, measure
 
+#: Track of the trainings.
 TRACK = TrainConfig.env
+
+#: Fixed excitations that a useful policy exceeds.
 EXCITATIONS = ("silverbox-multisine", "silverbox-arrow", "uniform", "prbs")
+
+#: Systems of an evaluation.
 SYSTEMS = 256
+
+#: Metric of an evaluation.
 METRIC = "log_posterior_gain"
+
+#: Checkpoints of a training.
 CHECKPOINTS = 50
+
+#: Length of a training [samples].
 ENOUGH = 1_500_000
+
+#: Longest training [s].
 PATIENCE = 120.0
+
+#: Longest median time to a useful policy that passes [s].
 TARGET_SECONDS = 60.0
+
+#: Names of the rows, for Stable-Baselines3 by number of environments.
 OURS = "ours, PPO's settings without features"
 DEFAULTS = {1: "SB3's defaults, DummyVecEnv of 1", 8: "SB3's defaults, DummyVecEnv of 8"}
 USEFUL = "from starting train.py to a useful policy"

@@ -1,4 +1,4 @@
-"""Compares the speed of this version with an older one: ``python -m benchmarks.version_comparison --commit REV``.
+"""Compare the speed of this version with an older one: ``python -m benchmarks.version_comparison --commit REV``.
 
 Each version runs in its own tree and process, and both are timed in turns.
 """
@@ -15,7 +15,7 @@ from benchmarks.peer_process import ROOT, Child
 from benchmarks.section_tables import Claim, Section, print_section, ratio
 from benchmarks.timed_rounds import measure
 
-#: What the rows are called, their unit, and how much of the old version's speed is to be reached.
+#: Unit of each row, and the smallest ratio of the new speed to the old one that passes.
 ROWS = {
     "inference Eq. (2)": ("env-steps/s", 1.0),
     "inference Eq. (1)": ("env-steps/s", 0.95),

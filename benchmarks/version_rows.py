@@ -1,6 +1,6 @@
-"""The timed rows of one version of this project, run as a child of `benchmarks.version_comparison` in its tree.
+"""Timed rows of one version of this project; `benchmarks.version_comparison` runs them as a child in its tree.
 
-It answers requests as `benchmarks.peers` does. Versions before `estimator.engine` had other names for the update.
+The process answers requests like `benchmarks.peers`. Versions without `estimator.engine` name the update otherwise.
 """
 
 import json
@@ -17,19 +17,31 @@ import numpy as np
 
 import duffing_env  # noqa: F401  registers the tracks
 
+#: Environments side by side.
 SIZE = 1024
+
+#: Samples of a record.
 SAMPLES = 256
+
+#: Samples of random actions; they repeat.
 DRAWN_ACTIONS = 64
-#: Of Eq. (1) as older versions have it, or with noises that are known, too.
+
+#: Track of Eq. (1): under its older name where a version has it.
 _EQUATION_1 = "duffing_env/Continuous-v0"
 if _EQUATION_1 not in gym.registry:
     _EQUATION_1 = "duffing_env/Amplitude-v1"
+
+#: Options that make its noises known; the older track has known noises.
 KNOWN: dict[str, Any] = {"noise_range": 1.0, "noise_hypotheses": 1} if _EQUATION_1.endswith("1") else {}
+
+#: Track of each row.
 TRACKS = {
     "Eq. (2)": "duffing_env/Amplitude-v0",
     "Eq. (1)": _EQUATION_1,
     "Eq. (1), noises unknown": "duffing_env/Amplitude-v1",
 }
+
+#: Whether this version has the engine.
 HAS_ENGINE = find_spec("estimator.engine") is not None
 
 Action = Callable[[int], float]

@@ -22,18 +22,25 @@ from estimator.inference.noise_grid import NoiseGridSize
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
-#: Track to the policies that are played on it, which know no more of the noises than the track says.
+#: Policies to play on each track; they know of the noises only what the track says.
 PLAYED = {
     "duffing_env/Amplitude-v1": ("prbs", "ppo/amplitude-v1"),
     "duffing_env/Amplitude-v0": ("prbs", "ppo/amplitude"),
 }
-NOISE, SAMPLES = 5e-4, 256  # V
 
-#: Options of an estimator with known noises, and of one with a rig's noises (`estimator.OnlineEstimator`).
+#: True standard deviation of both noises [V].
+NOISE = 5e-4
+
+#: Samples of an episode.
+SAMPLES = 256
+
+#: Options of an estimator with known noises.
 KNOWN: dict[str, Any] = {"noise_hypotheses": 1, "noise_shape": 1e6}
+
+#: Numbers of process and measurement noises that an estimator weighs on a rig.
 HYPOTHESES = (7, 7)
 
-#: Nats that wrong priors may cost.
+#: Largest loss by wrong priors that passes [nat].
 ASKED = 0.3
 
 
