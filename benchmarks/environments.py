@@ -1,4 +1,4 @@
-"""Section 2: environment steps per second, from one environment to thousands, beside environments without inference.
+"""Section 2: environment steps per second, from one environment to thousands, beside other packages' environments.
 
 An env-step is one environment's one step of its plant. The steps of ``NEXT_STEP`` autoreset that only start an episode
 are not counted, here or with the peers. Every run covers whole episodes, with their resets and endings.
@@ -120,7 +120,7 @@ def _batch_rows(size: int, peers: Peers) -> list[Row]:
 
 
 def _ours(size: int, name: str, track: str, **options: Any) -> list[Row]:
-    """Whole steps on one thread, and on two where there are more than a block."""
+    """Whole steps on one thread, and on two for more than one block."""
     rows = []
     for threads, title in ((1, "1 thread"), (2, "2 threads")):
         if threads == 1 or size > LANES:

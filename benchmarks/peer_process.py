@@ -57,7 +57,7 @@ def _last_line(text: str) -> str:
 
 
 class Child:
-    """A process that runs rows, one request at a time: see `benchmarks.peers` for what it is asked. A context manager.
+    """A process that runs rows, one request at a time (`benchmarks.peers` has the requests). A context manager.
 
     Args:
         command: that starts it.
@@ -83,7 +83,7 @@ class Child:
         self._stop()
 
     def _stop(self) -> int:
-        """End the process, which does so when its input ends; its exit status."""
+        """End the process by closing its input; return its exit status."""
         if self._process is None:
             return 0
         process, self._process = self._process, None
@@ -95,7 +95,7 @@ class Child:
         return process.returncode
 
     def row(self, name: str, title: str, unit: str) -> Row:
-        """The process's row ``name``, under a title of ours."""
+        """Make a row from the process's row ``name``, under another title."""
 
         def run(count: int) -> tuple[float, float]:
             answer = self.ask(name, count)

@@ -1,4 +1,4 @@
-"""The rows of peer packages. Runs in the peers' own environment, as a child of the benchmark, and imports none of ours.
+"""Rows of peer packages, run as a child of the benchmark in the peers' environment, without our packages.
 
 ``python -I peers.py SAMPLES.npz`` reads a request per line, ``["row", count]``, runs that row, ``count`` times as
 long, and answers with a line: ``{"seconds": ..., "work": ...}`` or ``{"error": ...}``. Each row is set up at its first
@@ -117,14 +117,14 @@ def gymnax_pendulum(num_envs: int, scanned: bool) -> Run:
 
 @cache
 def samples() -> dict[str, Any]:
-    """What the estimators get, as our side wrote it."""
+    """Read the estimators' input, which `benchmarks.estimators` has written."""
     with np.load(sys.argv[1]) as file:
         return {name: file[name] for name in file.files}
 
 
 @cache
 def row(name: str) -> Run:
-    """The row of this name, set up.
+    """Set up the row of a name.
 
     A kind of environment and a number of them; ``silverbox`` and what `benchmarks.silverbox_peer_filters.row` takes; or
     ``rigs`` and what `benchmarks.rigs.peer_methods.row` takes.
@@ -145,7 +145,7 @@ def row(name: str) -> Run:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what is installed here."""
+    """Versions of the packages that are installed here."""
     found = {}
     for package in PACKAGES:
         try:

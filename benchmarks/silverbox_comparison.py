@@ -1,4 +1,4 @@
-"""Compares peer packages with our estimators in the Silverbox protocol: same record, model, prior and tests.
+"""Compare peer packages with our estimators in the Silverbox protocol: same record, model, prior and tests.
 
 A peer gets all that it needs and does not learn: our prior, our estimates of the two noise variances at the end of the
 training section, and float64. Our free run simulates its coefficients, started by a filter with its noises, so that
@@ -106,7 +106,7 @@ class Contender:
 
 
 def compare(sections: Sections, outcomes: Mapping[str, ProtocolOutcome], wanted: bool = True) -> dict[str, Any]:
-    """Runs the peers, prints them beside ours, and returns what was measured, fit for JSON.
+    """Run the peers, print their rows beside ours, and return the results for the JSON file.
 
     Args:
         sections: The record, as the protocol cuts it.
@@ -134,7 +134,7 @@ def compare(sections: Sections, outcomes: Mapping[str, ProtocolOutcome], wanted:
 
 
 def given(sections: Sections, outcomes: Mapping[str, ProtocolOutcome]) -> dict[str, Any]:
-    """What `benchmarks.silverbox_peer_filters` reads: samples, models, priors, noises, and the tests' first outputs."""
+    """Input of `benchmarks.silverbox_peer_filters`: samples, models, priors, noises, and the tests' first outputs."""
     training, test = sections.training, sections.multisine
     arrays: dict[str, Any] = {
         "u": np.concatenate([training.u, test.u]),
@@ -207,7 +207,7 @@ def run(
 
 
 def _passes(ours: str, u: FloatArray, y: FloatArray) -> Callable[[int], float]:
-    """Goes through the samples, from the prior on, and returns their number."""
+    """Process the samples from the prior on, and return their number."""
 
     def action(count: int) -> float:
         for _ in range(count):
@@ -220,7 +220,7 @@ def _passes(ours: str, u: FloatArray, y: FloatArray) -> Callable[[int], float]:
 def judge(
     name: str, answer: Mapping[str, Any], time: Result, sections: Sections, outcomes: Mapping[str, ProtocolOutcome]
 ) -> Contender:
-    """Measures what an online peer answered."""
+    """Measure the errors of an online peer's answer."""
     noises = outcomes[MODELS[name]].beliefs[TRAINING_SAMPLES]
     learning = {}
     for samples, mean in zip(TRAINING_LENGTHS, answer["means"], strict=True):
@@ -238,7 +238,7 @@ def judge(
 def estimator_at(
     name: str, mean: FloatArray, process_variance: float, measurement_variance: float
 ) -> OnlineEstimator | None:
-    """Ours, with a peer's means (n,) of the joint state and its noises; None where a mean is not finite.
+    """Our estimator with a peer's means (n,) of the joint state and its noises; None if a mean is not finite.
 
     Of the state only the coefficients count: a simulation begins at rest, with the prior's uncertainty.
     """
@@ -252,7 +252,7 @@ def estimator_at(
 
 
 def _offline(peers: Peers, sections: Sections) -> Contender:
-    """Fastcan's row: fitted, and timed, once with each length."""
+    """Fit and time fastcan once with each length."""
     try:
         answer = peers.ask("silverbox fastcan - protocol", 1)
     except NotAvailable as error:
@@ -265,7 +265,7 @@ def _offline(peers: Peers, sections: Sections) -> Contender:
 
 
 def faster(contenders: Mapping[str, Contender], title: str) -> tuple[float, bool]:
-    """How many times as fast as a peer ours is with the peer's model, and whether its errors are no larger.
+    """The ratio of a peer's time to ours with the peer's model, and whether our errors are no larger.
 
     Errors are compared as the submission line gives them, to the microvolt. NaN and False without the peer.
     """
@@ -279,7 +279,7 @@ def faster(contenders: Mapping[str, Contender], title: str) -> tuple[float, bool
 def report(
     contenders: Mapping[str, Contender], claims: Mapping[str, tuple[float, bool]], versions: Mapping[str, str]
 ) -> None:
-    """Prints the table, and how much faster ours is than dynamax's filter with the same model."""
+    """Print the table, and the ratio of times of dynamax's filter and ours with the same model."""
     print_texts_and_tables("\nPeers, and ours with the same model:", as_table(contenders))
     for title, contender in contenders.items():
         if contender.reason:
@@ -330,11 +330,11 @@ class Config:
     """Run the official Silverbox protocol for every estimator of this project, and for other packages beside them."""
 
     json: Path | None = None
-    """File for the results, machine-readable."""
+    """JSON file for the results."""
     figures: Path = Path("runs/silverbox")
     """Folder for the figures of errors, learning and parameters, as PNG."""
     data: Path | None = None
-    """The record, or its folder; searched for on this machine if not given."""
+    """The record or its folder; by default it is searched for on this machine."""
 
 
 def main(config: Config) -> None:

@@ -62,15 +62,15 @@ class Config:
     """Long runs on every track."""
 
     steps: int = 1_000_000
-    """Samples of each track."""
+    """Number of samples of each track."""
     runs: tuple[str, ...] = ()
-    """Names of tracks, filter-paper, filter-duffing; all if none."""
+    """Names of tracks, filter-paper or filter-duffing; none stands for all."""
     json: Path | None = None
     """File for the counts."""
 
 
 def main(config: Config) -> None:
-    """Run, and print the table."""
+    """Run all, and print the table."""
     from agents.console_output import format_table, print_texts_and_tables
 
     names = [name.split("/")[1] for name in TRACKS if record_available() or "Replay" not in name] + list(FILTERS)
@@ -111,7 +111,7 @@ def soak(name: str, steps: int) -> dict[str, int]:
 
 
 def _play(envs: Any, play: Callable[..., Any], rounds: int, rng: np.random.Generator, counts: dict[str, int]) -> None:
-    """Some rounds of all rows, counted."""
+    """Step all rows for some samples, and count."""
     envs.reset(seed=int(rng.integers(2**31)))
     low, high = envs.observation_space.low, envs.observation_space.high
     model, before = envs.experiment.model, 0
@@ -148,7 +148,7 @@ def filtered(name: str, steps: int) -> dict[str, int]:
 
 
 def _unsound(model: Any, records: Any) -> int:
-    """How many records (n, size) are no belief: all are looked at together, and one by one what is not plainly one."""
+    """Number of records (n, size) that are no belief: a check of all together, then of each doubtful one."""
     covs = records[:, covariance_indices(model)]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         stds = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))

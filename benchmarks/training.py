@@ -53,7 +53,7 @@ USEFUL = "from starting train.py to a useful policy"
 
 
 def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
-    """Time the loops, then train."""
+    """Time the loops, then the trainings."""
     rows = [Row(OURS, "env-steps/s", _loop(_our_model, TrainConfig.torch_threads))]
     rows += [Row(name, "env-steps/s", _loop(partial(_default_model, n), CORES)) for n, name in DEFAULTS.items()]
     results = measure(rows, repetitions, on_row)
@@ -77,7 +77,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
         f"{PPOSettings().batch_size}, {PPOSettings().n_epochs} epochs, {TrainConfig.torch_threads} thread of torch. "
         f"SB3's: 2048 samples of each environment, batches of 64, 10 epochs, {CORES} threads.",
         f"Useful: a checkpoint (every {TrainConfig.steps // CHECKPOINTS:,} samples) whose {METRIC.replace('_', ' ')} "
-        f"over {SYSTEMS} systems has its 95 % interval above those of all fixed excitations, whose upper ends are "
+        f"over {SYSTEMS} systems has its 95 % interval above the intervals of all fixed excitations, with upper ends "
         + ", ".join(f"{name} {high:.2f}" for name, high in bars.items())
         + f" nat. Each run has another seed and an empty cache of compiled code. Reached at {found}.",
     ]
@@ -87,7 +87,7 @@ def run(repetitions: int, on_row: Callable[[str], None]) -> Section:
 
 
 def _loop(make: Callable[[], Any], threads: int) -> Callable[[int], tuple[float, float]]:
-    """Rounds of roll-out and update of a model that is made at the first call, on as many threads of torch."""
+    """Time rounds of roll-out and update of a model, which is made at the first call, on a number of torch threads."""
     made = cache(make)
 
     def run(count: int) -> tuple[float, float]:
@@ -124,7 +124,7 @@ def _bars() -> dict[str, float]:
 
 
 def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> float:
-    """Run ``train.py``, then evaluate its checkpoints in order; seconds until the first useful one was on disk."""
+    """Run ``train.py``, evaluate its checkpoints in order, and return the time until the first useful one [s]."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "run"
         started = time.time()
@@ -138,7 +138,7 @@ def _time_to_useful(seed: int, bar: float, reached: list[dict[str, float]]) -> f
 
 
 def _train_a_while(output: Path, seed: int, cache: Path) -> list[Path]:
-    """Run ``train.py`` as it is, up to a checkpoint that must be useful; the checkpoints so far, in order.
+    """Run ``train.py`` up to a checkpoint that must be useful; return its checkpoints in order.
 
     It is the beginning of a whole run, with the whole run's schedule.
     """

@@ -46,25 +46,25 @@ ASKED = 0.3
 
 @dataclass(frozen=True)
 class Config:
-    """Coverage where the priors of the noises are wrong, and what is lost against known noises."""
+    """Coverage with wrong priors of the noises, and the loss against known noises."""
 
     systems: int = 200
-    """Oscillators of each cell."""
+    """Number of oscillators in each cell."""
     hypotheses: tuple[int, ...] = HYPOTHESES
-    """Of the estimator: one number, or two (`noise_hypotheses`)."""
+    """Noise hypotheses of the estimator: one number, or two."""
     factors: tuple[float, ...] = (0.1, 1 / 3, 1.0, 3.0, 10.0)
-    """Where the priors are centred, in parts of the truth: in all combinations, but both at the truth."""
+    """Centres of the priors over the truth: all pairs, without both at the truth."""
     tracks: tuple[str, ...] = tuple(PLAYED)
-    """Of Eq. (1) and of Eq. (2)."""
+    """Tracks of Eq. (1) and Eq. (2)."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     json: Path | None = None
     """File for the results."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What one pair of priors made of the systems.
+    """Results of one pair of priors.
 
     Attributes:
         center: of the priors of process and measurement noise, in parts of the truth.
@@ -78,7 +78,7 @@ class Cell:
 
 
 def inputs_of(policy: str, track: str, systems: int, seed: int) -> FloatArray:
-    """(samples, systems, 1) actions of a policy on the track as it is, but for the noises' true values."""
+    """Actions (samples, systems, 1) of a policy on the track with the true noises of this benchmark."""
     envs = make_track_batch(track, systems, {"noise_range": 1.0, "horizon": SAMPLES})
     player = make_policy(policy, envs, seed=seed)
     observations, _ = envs.reset(seed=seed)
@@ -94,7 +94,7 @@ def inputs_of(policy: str, track: str, systems: int, seed: int) -> FloatArray:
 def identified(
     track: str, center: tuple[float, float], actions: FloatArray, seed: int, weighing: dict[str, Any]
 ) -> Cell:
-    """Play the inputs again to an estimator whose priors are centred so."""
+    """Update estimators whose priors have these centres, on the same inputs."""
     systems = actions.shape[1]
     guesses = dict(zip(("process_noise_guess", "measurement_noise_guess"), np.multiply(center, NOISE), strict=True))
     options = {"process_noise": NOISE, "measurement_noise": NOISE, "noise_range": 1.0, "max_output": NO_LIMIT}
@@ -113,7 +113,7 @@ def identified(
 
 
 def rows(cells: list[Cell], known: Cell) -> list[list[str]]:
-    """Of a table: the priors, coverage of each coefficient and of all, what is lost, and its standard error."""
+    """Rows of a table: the priors, coverage of each coefficient and of all, and the loss with its interval."""
     found = []
     for cell in cells:
         lost = known.density - cell.density
@@ -125,7 +125,7 @@ def rows(cells: list[Cell], known: Cell) -> list[list[str]]:
 
 
 def verdict(cells: list[Cell], known: Cell) -> dict[str, Any]:
-    """Whether the cells are calibrated, and none loses too much."""
+    """Say whether the cells are calibrated and lose at most `ASKED`."""
     hits = [int(count) for cell in cells for count in cell.inside.sum(axis=0)]
     pooled, meets, is_calibrated = judge_coverage(hits, [len(known.density)] * len(hits))
     lost = [float((known.density - cell.density).mean()) for cell in cells]

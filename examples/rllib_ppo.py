@@ -61,7 +61,7 @@ def main(args: Args) -> Path:
         raise ValueError(
             f"total_timesteps must be at least a roll-out, {least}, but are {args.total_timesteps}; take more"
         )
-    ray.init(os.environ.get("RAY_ADDRESS", "local"))  # and not whatever cluster runs on this machine
+    ray.init(os.environ.get("RAY_ADDRESS", "local"))  # else Ray joins a cluster that runs on this machine
     algorithm, steps = config.build_algo(), 0
     while steps + config.train_batch_size <= args.total_timesteps:
         result = algorithm.train()

@@ -116,7 +116,7 @@ def around_bench(**options):
 
 
 def on_the_record(envs, actions):
-    """The recorded inputs in parts of the largest, whatever the actions: but off the record for those beyond 1."""
+    """The recorded inputs in parts of the largest, for any actions up to 1; an action beyond 1 leaves the record."""
     played = np.minimum(envs._batch.row_values("ELAPSED_SAMPLES").astype(int), envs.horizon - 1)
     recorded = envs.recorded_input[played] / envs.max_input
     return (recorded + np.where(np.abs(np.ravel(actions)) > 1, 0.1, 0.0)).astype(np.float32)

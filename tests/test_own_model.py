@@ -1,4 +1,4 @@
-"""A model of one's own: what a declaration of a few lines gives, with nothing else."""
+"""Tests of a user's model: everything works from its declaration of a few lines alone."""
 
 import gymnasium as gym
 import numpy as np

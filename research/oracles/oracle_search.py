@@ -196,7 +196,7 @@ class Config:
     systems: int = 256
     """Number of systems: the first rows of a batch that is reset with seed 0."""
     first: int = 0
-    """The first of them that is searched, or checked; those before stay as they are stored."""
+    """First system to search or check; earlier ones stay as they are stored."""
     tries: int = _MIN_STARTS
     """Starts of a search."""
     seed: int = 0

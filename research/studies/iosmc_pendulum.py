@@ -40,7 +40,7 @@ PUBLISHED = {"uniform": (1.33, 0.21), "prbs": (2.16, 0.35), "IO-SMC², IBIS": (3
 
 @dataclass(frozen=True)
 class Config:
-    """Compare policies with those of IO-SMC² on its pendulum."""
+    """Compare policies with IO-SMC²'s on its pendulum."""
 
     policies: tuple[str, ...] = ("efe", "ppo/pendulum", "velocity-sign", "prbs", "uniform")
     """Names or run folders."""

@@ -97,7 +97,7 @@ CASES = {
 
 
 def random_belief(model, rng):
-    """A belief near those of the tracks: states a third of their sizes, coefficients with a few percent."""
+    """A belief near the tracks' beliefs: states at a third of their sizes, coefficients with a few percent."""
     centers = {
         "difference": [1.8, -0.4, -0.93, 0.38],
         "duffing": [0.45, 1.4, 0.07, 0.4],
@@ -272,7 +272,7 @@ def test_an_output_of_a_fast_oscillation_is_predicted_within_the_noise():
 
 
 def test_few_steps_are_enough_to_plan_with():
-    """The nats of plans of Eq. (1) are those of sixteen exact steps within 0.06, and their differences within 0.02."""
+    """Plans of Eq. (1) gain as much as with sixteen exact steps within 0.06 nat, and differ alike within 0.02."""
     belief, fine = ContinuousExperiment().prior_belief, replace(duffing(), substeps=16)
     u = np.random.default_rng(2).choice([-0.15, 0.15], (24, LANES))
     W, found = block_after(duffing(), 0, belief, u, terms(duffing()))

@@ -141,7 +141,7 @@ def test_a_rig_may_be_one_that_ships(tmp_path, monkeypatch):
 
 
 def test_a_bad_value_shows_no_traceback(tmp_path):
-    """In a process of its own, whatever is printed before."""
+    """In a process of its own; other output may come before."""
     finished = subprocess.run(
         [sys.executable, ROOT / "evaluate.py", "--policies", "foo"],
         env=os.environ | {"COLUMNS": "400"}, capture_output=True, text=True, timeout=600, cwd=tmp_path,

@@ -439,7 +439,7 @@ def precisions(belief, plan):
 
 
 def random_belief(rng):
-    """A belief about Eq. (2) near those of the tracks."""
+    """A belief about Eq. (2) near the tracks' beliefs."""
     coefficients = np.array([1.8, -0.4, -0.93, 0.38])
     scale = np.concatenate([[0.02, 0.02], 0.03 * np.abs(coefficients)])
     factor = np.eye(6) + 0.3 * np.tril(rng.normal(0, 1, (6, 6)), -1)

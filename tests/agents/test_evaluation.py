@@ -117,7 +117,7 @@ def act(name, options):
 
 
 def act_as_network(name, options):
-    """As `act`: a product of matrices rounds by its size, so that the actions are those of the batch, and checked."""
+    """Act as `act` does, on the whole batch: the rounding of a matrix product depends on its size."""
     policy, weights, envs = (
         load_policy(name),
         load_file(Path(name) / WEIGHTS_FILE),
@@ -175,7 +175,7 @@ def run_folder(tmp_path_factory):
     ],
 )
 def test_metrics_are_those_of_single_environments(name, options, share_ended, run_folder, without_record):
-    # Inputs and outputs are read off observations, in float32: less than ten roundings, with those of sums of squares.
+    # Inputs and outputs are read from observations in float32: less than ten roundings, with the sums of squares.
     slack = 16 * rounding.U32
     name = run_folder if name == "run_folder" else name
     (evaluation,) = evaluate_policies([name], systems=SYSTEMS, seed=SEED, options=options)
@@ -261,7 +261,7 @@ def test_sample_efficiency_is_one_for_the_regime_and_more_for_a_better_policy(re
     assert found["prbs", "silverbox_equivalent"] > 20
     # At the limit of 0.15 V instead of its own peak of some 0.12 V, the regime tells more.
     assert 1 < found["prbs", "silverbox_equivalent"] / found["prbs", "full_peak_equivalent"] < 6
-    # There is none of more power than the budget.
+    # No input has more power than the budget.
     (limited,) = evaluate_policies(["uniform"], "duffing_env/Power-v0", 2)
     assert "full_peak_equivalent" not in limited.metrics
 
@@ -396,7 +396,7 @@ def test_the_replay_environment_is_evaluated(record):
     assert np.isnan(on_record.inputs[samples:]).all()
     assert on_record.metrics["ended_early"].tolist() == [1, 1]
     assert on_record.gain_curve[-1] == pytest.approx(on_record.gain_curve[samples])
-    # A record answers nothing but its own input: the episode is over, and nothing was learned.
+    # A record answers only its own input: the episode ends, and nothing was learned.
     assert np.isfinite(off_record.inputs).sum(axis=0).tolist() == [1, 1]
     assert off_record.metrics["information_gain"].tolist() == [0, 0]
     assert off_record.metrics["ended_early"].tolist() == [1, 1]

@@ -93,7 +93,7 @@ TITLES = ["$\\frac{$", "<script>alert(1)</script>", "\x1b[31mred", "=1+1", "\\te
 
 
 def test_no_name_is_taken_for_code(tmp_path):
-    """Names of policies are whatever users write: no formula, element or control code comes of them."""
+    """Users choose the names of policies: no formula, element or control code may come of them."""
     (first, *_) = evaluate_policies(["uniform"], systems=4, options={"horizon": 8})
     settings = ComparisonSettings("duffing_env/Amplitude-v0", 4, 0, {})
     named = [replace(first, policy=title) for title in TITLES]

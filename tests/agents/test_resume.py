@@ -1,4 +1,4 @@
-"""Checkpoints and resuming: what a kill loses, and that nothing else is lost."""
+"""Tests of checkpoints and resuming: a kill loses only the samples since the latest checkpoint."""
 
 import csv
 import json

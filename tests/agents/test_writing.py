@@ -69,7 +69,7 @@ WRITERS = {
 
 @contextmanager
 def limited(size):
-    """No file can grow beyond so many bytes, as by ``ulimit -f``."""
+    """Limit the size of files [bytes], as ``ulimit -f`` does."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

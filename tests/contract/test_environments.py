@@ -164,7 +164,7 @@ def impossible(env):
     experiment = env.experiment
     for state in experiment.truth_model.states:
         yield from ((f"X_{state}", value) for value in (np.nan, np.inf, -np.inf, 1e200))
-    # A mixture goes on from its members, and an observation of one's own is asked of the belief as it is.
+    # A mixture continues from its members; a user's observation is computed from the present belief.
     if experiment.noise_hypotheses == 1 and not callable(experiment.observation):
         yield from ((name, value) for name in experiment.model.coefficients for value in (np.nan, np.inf))
 

@@ -33,7 +33,7 @@ def changed(**entries):
     record = PRIOR.record.copy()
     for name, value in entries.items():
         record[belief_rows(PRIOR.model).index(name)] = value
-    return PRIOR.with_records([record])[0]  # past the checks, as those of an environment
+    return PRIOR.with_records([record])[0]  # without the checks, as in an environment
 
 
 def started(horizon=100, truth=SILVERBOX_TWIN, belief=PRIOR):

@@ -40,7 +40,7 @@ class Lanes:
 
     def __init__(self, nonlinear=True, reward="information_gain"):
         self.model = difference("paper" if nonlinear else "linear")
-        # A linear belief is that of a replayed record, whose truth has the model's own parameters.
+        # A linear belief comes from a replayed record, whose truth has the model's own parameters.
         self.kernel_spec = SimulatedExperiment(reward=reward).kernel_spec._replace(belief_model=self.model)
         if not nonlinear:
             self.kernel_spec = self.kernel_spec._replace(plant_model=None)
@@ -90,7 +90,7 @@ class Lanes:
 
 
 def random_belief(rng):
-    """Means and a covariance of the coefficients, ill-conditioned as those of an experiment are."""
+    """Means and an ill-conditioned covariance of the coefficients, as in an experiment."""
     mean = to_coefficients(SILVERBOX_TWIN) + 0.05 * rng.standard_normal(4)
     factor = rng.standard_normal((4, 4)) * 10 ** rng.uniform(-4, -1, (4, 1))
     return mean, factor @ factor.T

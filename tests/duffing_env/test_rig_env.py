@@ -89,7 +89,7 @@ def test_around_the_plant_inputs_and_outputs_are_in_its_units():
     np.testing.assert_allclose(env.belief.coefficients_mean, estimator.belief.coefficients_mean, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.slow  # the planner's kernels of another model; those of two others are in the tests
+@pytest.mark.slow  # compiles the planner's kernels of a third model; fast tests cover two
 def test_the_planner_plays_it():
     envs = make_vec(2, horizon=8)
     observations, _ = envs.reset(seed=0)

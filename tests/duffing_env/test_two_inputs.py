@@ -155,7 +155,7 @@ def test_a_signal_plays_an_independent_sequence_on_each_input():
     assert len({tuple(row) for row in np.concatenate([first.T, second.T]).tolist()}) == 8
     single = make_policy("prbs", ModelEnv(**TWO_FORCES | {"max_rms": None}), seed=5)
     action, _ = single.predict(np.zeros(27))
-    np.testing.assert_array_equal(action, played[0, 0])  # whatever the number of rows
+    np.testing.assert_array_equal(action, played[0, 0])  # for any number of rows
 
 
 def test_a_power_budget_sums_over_the_inputs():

@@ -256,7 +256,7 @@ def test_a_system_of_choice(options):
         assert step[1] == step_results[1][35]
         if step[2] or step[3]:
             break
-    # Another system, with the same noise; only of the rows that are reset, and without noises as they are drawn.
+    # Only the rows that are reset get another system; their noises stay.
     mask = np.arange(40) < 2
     other = {"m": [7e-6] * 40, "c": 2e-4, "a": 1.0, "b": 0.0}
     drawn.reset(seed=3)

@@ -24,7 +24,7 @@ FIELDS = {"mean": np.array([0.1, -2.0, 1.8e5, 42.0, 7e5]), "gamma": (2.0, 2e-6),
 
 
 def covariance(seed=0):
-    """(5, 5), of quantities as different in size as those of the oscillator."""
+    """A covariance (5, 5) of quantities that differ in size as the oscillator's do."""
     std = np.array([1e-3, 0.3, 500.0, 4e-5, 2e3])
     factor = np.random.default_rng(seed).standard_normal((5, 9))
     return np.outer(std, std) * (factor @ factor.T) / 9
@@ -74,7 +74,7 @@ def standardised(one, which):
 
 @pytest.mark.parametrize(("known", "rest"), [(None, [0, 1, 2]), (1, [0, 2])], ids=["all free", "damping known"])
 def test_entropy_and_density_equal_scipy(known, rest):
-    """A parameter that is known is left out, whatever is given for it."""
+    """A known parameter is left out, for any given value."""
     one = belief() if known is None else fixed(2 + known)
     normal, std, log_unit = standardised(one, rest)
     assert one.entropy() == pytest.approx(normal.entropy() + log_unit, rel=1e-12)

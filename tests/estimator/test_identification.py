@@ -247,7 +247,7 @@ def test_blows_are_found_wherever_they_are(kind, blows):
 
 @pytest.mark.parametrize("kind", ["velocity", "acceleration"])
 def test_two_wells_are_found_by_a_sensor_that_does_not_show_them(kind):
-    # The accelerometer's frequency is four times that of the motion, and its first look found no wells for 5, 7 and 9.
+    # The accelerometer's frequency is four times the motion's; one look for wells misses seeds 5, 7 and 9.
     for seed in (1, 5, 7, 9):
         result = identify(rig_of(WELLS, kind), simulated(WELLS, seed, kind=kind, start=np.sqrt(2500.0 / 4e7)))
         assert np.abs(deviations(result, WELLS[0])).max() < 4.5

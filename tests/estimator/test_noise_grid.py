@@ -154,7 +154,7 @@ def test_first_weights_are_half_a_cauchy_density_of_the_ratio():
     records = member_priors(silverbox_prior(), (3, 1))
     middle = np.log(2e-3)
     ratios = np.sqrt(records[:, -3] / records[:, -4] / (records[:, -1] / records[:, -2]))
-    # A density of the logarithm is that of the ratio, 1/(1 + (ratio/scale)²), times the ratio.
+    # The density of the logarithm is the density of the ratio, 1/(1 + (ratio/scale)²), times the ratio.
     density = ratios / (1 + (ratios / np.exp(middle)) ** 2)
     noises = records[:, -4:]
     np.testing.assert_allclose(initial_weights(noises, middle), density / density.sum(), rtol=1e-12)

@@ -353,7 +353,7 @@ def test_experiments_that_were_repeated_are_two_records():
         for noisy in (y, y + 1e-3 * rng.standard_normal(1_000))
     )
     assert len(read_records([one, other], Rig(0.01))) == 2
-    # A converter whose levels are ten times the noise: most outputs are those of the first time.
+    # A converter whose levels are ten times the noise: most outputs repeat the first record's.
     level = np.ptp(y) / 100
     coarse = [level * np.round((y + 0.1 * level * rng.standard_normal(1_000)) / level) for _ in range(2)]
     assert 0.85 < (coarse[0] == coarse[1]).mean() < 1

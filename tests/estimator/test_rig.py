@@ -198,7 +198,7 @@ def test_a_guess_is_the_prior_s_interval():
     for name in "cab":
         low, high = GUESS[name]
         mean, std, _ = parameters[name]
-        # To first order the prior's moments give back those of the guess, as far as m is sharp: it is known to 15 %.
+        # To first order the prior's moments give the guess's moments, as far as m is sharp: it is known to 15 %.
         assert mean == pytest.approx((low + high) / 2, abs=0.1 * (high - low))
         assert std == pytest.approx((high - low) / 2 / 1.645, rel=0.25)
     assert parameters["m"][0] == pytest.approx(0.387, abs=0.01)

@@ -33,7 +33,7 @@ def weighed(weights: np.ndarray, energies) -> tuple[np.ndarray, float]:
 
 
 def mixed(weights: np.ndarray, members):
-    """One belief with the moments of a mixture; a noise has those of its variance, of relative variance 1/shape."""
+    """One belief with the moments of a mixture; a noise's variance has the relative variance 1/shape."""
     mean = sum(w * m.mean for w, m in zip(weights, members, strict=True))
     cov = sum(w * (m.cov + np.outer(m.mean - mean, m.mean - mean)) for w, m in zip(weights, members, strict=True))
     noises = {}

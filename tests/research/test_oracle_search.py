@@ -135,7 +135,7 @@ def test_the_command_stores_only_better_inputs(empty_folder, capsys):
     assert np.all(gains(systems, better.values) > 18.0)
     np.testing.assert_array_equal(better.values, systems.criterion_and_peak(better.inputs)[0])
     np.testing.assert_array_equal(better.bounds, [40.0, np.nan])
-    # One system more, and those before stay as they are, though they were searched with less luck.
+    # One system more: the stored ones stay, although their search found worse inputs.
     main(Config(env=SHORT, systems=3, first=2, tries=1, seed=1))
     np.testing.assert_array_equal(Oracle.of(TrackSystems.of(SHORT, 4)).inputs[:2], better.inputs)
     main(Config(env=SHORT, systems=2, tries=1, seed=1))

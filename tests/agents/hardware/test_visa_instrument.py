@@ -20,7 +20,7 @@ from estimator import Rig, identify
 
 pytest.importorskip("pyvisa", reason="pip install 'duffing-env[instrument]'")
 ROOT = Path(__file__).parents[3]
-#: The run's clock jumps: that of the instrument, which is in another process, ticks with it.
+#: The run's clock jumps; the instrument's clock, in another process, follows it.
 COMMAND = """
 import agents.hardware.experiment_run
 from agents.commands import main

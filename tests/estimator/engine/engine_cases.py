@@ -63,7 +63,7 @@ class Case:
 
     @property
     def operations(self) -> int:
-        """Roundings that can follow on one another in a sample: those of the integrator's stages, and of the algebra.
+        """Roundings in sequence within a sample: of the integrator's stages and of the algebra.
 
         A stage sums a product with each quantity for the mean, its slopes and the noise, and evaluates the equation,
         of at most 20 operations; the algebra sums over all quantities twice per sensor, and divides.
