@@ -50,6 +50,7 @@ class Plant:
         substeps: Runge-Kutta steps per sample; 0 for a difference equation.
         held: whether the noise is constant over a sample.
         independent: whether each state has noise of its own, which ``noise`` scales.
+        slopes: whether ``move`` and ``show`` take inputs and their time derivatives, (2, inputs).
     """
 
     move: Callable
@@ -58,6 +59,7 @@ class Plant:
     substeps: int = 0
     held: bool = False
     independent: bool = False
+    slopes: bool = False
 
     def effects(self, z, c) -> np.ndarray:
         """How each source of unit process noise moves the state, (n, sources)."""
@@ -68,24 +70,28 @@ class Plant:
     def of(cls, model, ratios=None) -> Plant:
         """The plant of a declaration's strings; ``ratios``: factor on each state's noise."""
 
+        slopes = "derivative(" in str([*model.update_expressions, *model.outputs.values()])
+
         def evaluated(texts, z, c, taps=()):
             """Values of texts, with the inputs of one age after the other, newest first."""
             names = dict(zip(model.names, [*z, *c], strict=True)) | {"pi": np.pi, **model.constants}
-            for suffix, values in zip(("", "[-1]", "[-2]"), taps, strict=False):
-                written = (f"{name}{suffix}" for name in model.inputs)
+            forms = ("{}", "derivative({})") if slopes else ("{}", "{}[-1]", "{}[-2]")
+            for form, values in zip(forms, taps, strict=False):
+                written = map(form.format, model.inputs)
                 names |= dict(zip(written, np.atleast_1d(values), strict=True))
             return [evaluate(parse(text, model.name), names, FUNCTIONS) for text in texts]
 
         def move(z, c, u):
-            return evaluated(model.update_expressions, z, c, [u] if model.is_continuous else u)
+            return evaluated(model.update_expressions, z, c, [u] if model.is_continuous and not slopes else u)
 
         return cls(
             move,
-            lambda z, c, u: evaluated(model.outputs.values(), z, c, [u]),
+            lambda z, c, u: evaluated(model.outputs.values(), z, c, u if slopes else [u]),
             lambda z, c: np.multiply(evaluated(model.noise, z, c), 1.0 if ratios is None else ratios),
             substeps=model.substeps if model.is_continuous else 0,
             held=model.held,
             independent=model.independent_noise,
+            slopes=slopes,
         )
 
 
@@ -138,9 +144,15 @@ def acting(plant: Plant, u: np.ndarray, t: int, interpolation: str) -> tuple[flo
     return {"zero_order": (taps[0],), "linear": (taps[1], taps[0] - taps[1])}[interpolation]
 
 
-def input_seen(plant: Plant, inputs: Sequence[float]) -> float:
+def input_at(plant: Plant, inputs: Sequence[float], t: float) -> float | np.ndarray:
+    """What a differential equation takes of the input at a time t in [0, 1] of the sample."""
+    u = polynomial(inputs, t)
+    return np.stack([u, polynomial([k * u for k, u in enumerate(inputs)][1:], t)]) if plant.slopes else u
+
+
+def input_seen(plant: Plant, inputs: Sequence[float]) -> float | np.ndarray:
     """The input at the end of a sample: the newest tap, or the polynomial's value."""
-    return polynomial(inputs, 1.0) if plant.substeps else inputs[0]
+    return input_at(plant, inputs, 1.0) if plant.substeps else inputs[0]
 
 
 def moved(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) -> np.ndarray:
@@ -148,7 +160,7 @@ def moved(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) -
     z = np.asarray(z)
     if not plant.substeps:
         return rows(plant.move(z, c, inputs), z)
-    return runge_kutta(lambda x, t: rows(plant.move(x, c, polynomial(inputs, t)), x), z, plant.substeps)
+    return runge_kutta(lambda x, t: rows(plant.move(x, c, input_at(plant, inputs, t)), x), z, plant.substeps)
 
 
 def spread(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) -> np.ndarray:
@@ -159,7 +171,7 @@ def spread(plant: Plant, z: np.ndarray, c: np.ndarray, inputs: Sequence[float]) 
         return G @ G.T
 
     def rates(x: np.ndarray, t: float) -> np.ndarray:
-        z, u = x[:n], polynomial(inputs, t)
+        z, u = x[:n], input_at(plant, inputs, t)
         f = lambda z: plant.move(z, c, u)  # noqa: E731
         slope, G = jacobian(f, z), plant.effects(z, c)
         N = x[n:].reshape(n, -1)
