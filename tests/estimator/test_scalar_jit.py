@@ -268,6 +268,27 @@ def test_loops_over_lanes_are_of_eight_where_registers_are_wide(is_wide):
     assert len(re.findall(r"br i1 .*!llvm\.loop", text)) == is_wide
 
 
+def sums_of_rows(W):
+    for i in range(3):
+        for k in range(3):
+            for OWN_LANE in range(8):
+                W[(18 + 3 * i + k) * 8 + OWN_LANE] = W[3 * i * 8 + OWN_LANE] + W[(9 + k) * 8 + OWN_LANE]
+
+
+@pytest.mark.parametrize("is_wide", [False, True])
+def test_lanes_within_other_loops_are_independent(is_wide):
+    function = scalar_jit(sums_of_rows)
+    module = with_vector_metadata(next(iter(function.translate(("ptr",)).definitions.values())), is_wide)
+    text = str(binding.parse_assembly(module))
+    assert len(re.findall(r"(load|store) double.*!llvm\.access\.group", text)) == 3
+    assert text.count("llvm.loop.parallel_accesses") == 1
+    assert len(re.findall(r"br i1 .*!llvm\.loop", text)) == 1
+    W = np.random.default_rng(0).standard_normal(27 * 8)
+    expected = W[: 9 * 8].reshape(3, 3, 8)[:, :1] + W[9 * 8 : 12 * 8].reshape(3, 8)
+    function(W)
+    np.testing.assert_array_equal(W[18 * 8 :].reshape(3, 3, 8), expected)
+
+
 @pytest.mark.parametrize(("lines", "turns"), [(2, 2), (400, 1)])
 def test_turns_of_short_loops_go_side_by_side(lines, turns):
     sums = "".join(f"        a{i + 1} = a{i} * a{i}\n" for i in range(lines))

@@ -56,11 +56,18 @@ VECTOR_WIDTH = 8
 #: Length of a loop body up to which two turns are interleaved [lines]; longer ones would exceed the registers.
 _MAX_INTERLEAVED_LINES = 340
 
-#: Mark of a loop over lanes, with the number of interleaved turns (`with_vector_metadata`).
+#: Mark of a loop over lanes, with the number of interleaved turns (`with_vector_metadata`), and ``i`` for independence.
 _LOOP_MARK = ", !llvm.loop !lanes_{}"
 
 #: Pattern of these marks.
-_LOOP_MARK_PATTERN = re.compile(r", !llvm\.loop !lanes_(\d)")
+_LOOP_MARK_PATTERN = re.compile(r", !llvm\.loop !lanes_(\d)(i?)")
+
+#: Name of the index of loops whose turns have entries of their own, where LLVM cannot see it: their loads and stores
+#: are marked as independent of other turns.
+INDEPENDENT_INDEX = "OWN_LANE"
+
+#: Mark of such a load or store.
+_ACCESS_MARK = ", !llvm.access.group !lane_entries"
 
 _CONVERSIONS: dict[Any, str] = {np.float64: "double", np.int64: "i64", np.uint64: "word"}
 
@@ -73,17 +80,26 @@ def with_vector_metadata(text: str, has_avx512: bool) -> str:
 
     Args:
         text: text of the module.
-        has_avx512: whether the processor has AVX-512; without it the marks are removed.
+        has_avx512: whether the processor has AVX-512; without it only the independence of turns is stated.
     """
     head, *rest = _LOOP_MARK_PATTERN.split(text)
-    if not rest or not has_avx512:
-        return head + "".join(rest[1::2])
-    numbers = range(1, 1 + len(rest) // 2)
-    marked = (f", !llvm.loop !{2 + i}{part}" for i, part in zip(numbers, rest[1::2], strict=True))
-    metadata = f'!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR_WIDTH}}}\n'
-    metadata += "".join(f'!{turns} = !{{!"llvm.loop.interleave.count", i32 {turns}}}\n' for turns in (1, 2))
-    loops = (f"!{2 + i} = distinct !{{!{2 + i}, !0, !{turns}}}\n" for i, turns in zip(numbers, rest[::2], strict=True))
-    return f"{head}{''.join(marked)}{metadata}{''.join(loops)}"
+    marks = list(zip(rest[::3], rest[1::3], rest[2::3], strict=True))
+    group = 3 + len(marks)
+    body, loops, hints = head, "", ""
+    for number, (turns, independent, part) in enumerate(marks, 3):
+        properties = ["!0", f"!{turns}"] if has_avx512 else []
+        properties += [f"!{group + 1}", f"!{group + 2}"] if independent else []
+        body += f", !llvm.loop !{number}{part}" if properties else part
+        loops += f"!{number} = distinct !{{{', '.join([f'!{number}', *properties])}}}\n" if properties else ""
+    if loops and has_avx512:
+        hints = f'!0 = !{{!"llvm.loop.vectorize.width", i32 {VECTOR_WIDTH}}}\n'
+        hints += "".join(f'!{turns} = !{{!"llvm.loop.interleave.count", i32 {turns}}}\n' for turns in (1, 2))
+    if any(independent for _, independent, _ in marks):
+        loops += f'!{group} = distinct !{{}}\n!{group + 1} = !{{!"llvm.loop.parallel_accesses", !{group}}}\n'
+        # Short loops would be unrolled before they are vectorised.
+        loops += f'!{group + 2} = !{{!"llvm.loop.unroll.disable"}}\n'
+        body = body.replace(_ACCESS_MARK, f", !llvm.access.group !{group}")
+    return f"{body}{hints}{loops}"
 
 
 def flat_types(nested_types: Any) -> list[str]:
@@ -209,9 +225,16 @@ class FunctionTranslation(LlvmArithmetic):
             raise self._error(loop.iter, f"keeps {kept}, which must go into a block")
         self.lines[at + 2] = f"%i{n} = phi i64 [ 0, %{before} ], [ %n{n}, %{self._block} ]"
         self.lines += [f"%n{n} = add nsw i64 %i{n}, 1", f"%c{n} = icmp slt i64 %n{n}, {end}"]
-        calls = any("call void" in line for line in self.lines[at:])
-        is_of_lanes = is_number(count) and count % VECTOR_WIDTH == 0 and not calls
+        # Only the innermost loop can be vectorised, and LLVM complains of a mark on another.
+        is_innermost = not any("call void" in line or " = phi " in line for line in self.lines[at + 3 :])
+        is_of_lanes = is_number(count) and count % VECTOR_WIDTH == 0 and is_innermost
         marked = _LOOP_MARK.format(2 if len(self.lines) - at < _MAX_INTERLEAVED_LINES else 1) if is_of_lanes else ""
+        if marked and target.id == INDEPENDENT_INDEX:
+            marked += "i"
+            self.lines[at:] = [
+                line + _ACCESS_MARK if " = load double" in line or line.startswith("store double") else line
+                for line in self.lines[at:]
+            ]
         self.lines += [f"br i1 %c{n}, label %loop{n}, label %done{n}{marked}", f"done{n}:"]
         self._block = f"done{n}"
 
