@@ -20,7 +20,9 @@ from estimator.engine.storage_layout import (
     cubature_order,
     cubature_rows,
     integrator_rows,
+    is_packed,
     linearised_filter_layout,
+    packed_rows,
     trace_rows,
     update_layout,
 )
@@ -224,10 +226,17 @@ def compile_linearised_filter(
             independent noises.
     """
     layout = linearised_filter_layout(model, degree, follows_outputs, variable_step, noise_ratios)
+    packed = is_packed(model)
+    if packed:
+        layout |= number_rows(*packed_rows(model), first_row=len(layout))
 
     def make() -> str:
         from estimator.engine import printer_numba, symbolic, variational_rk4
         from estimator.engine.linearised_filter import linearised_filter_step
+        from estimator.engine.packed_filter import print_packed_filter
+
+        if packed:
+            return print_packed_filter(model, degree, follows_outputs, layout, lanes, variable_step, noise_ratios)
 
         lines, propagation = symbolic.propagate_sample(model, noise_ratios)
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
@@ -238,5 +247,5 @@ def compile_linearised_filter(
         )
         return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
 
-    key = repr((model.digest, degree, follows_outputs, lanes, variable_step, noise_ratios))
+    key = repr((model.digest, degree, follows_outputs, lanes, variable_step, noise_ratios, *(["packed"] * packed)))
     return LinearisedFilter(load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes)

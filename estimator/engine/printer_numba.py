@@ -109,6 +109,7 @@ def print_lane_loop(
     doc: str = "",
     single_lane: bool = False,
     shared_rows: Mapping[str, int] | None = None,
+    lane_index: str = "LANE",
 ) -> str:
     """Source of ``name(W, *uniform)``, which executes assignments in every lane of a block.
 
@@ -122,6 +123,7 @@ def print_lane_loop(
         doc: docstring of the function.
         single_lane: write ``name(W, LANE, *uniform)``, for one lane.
         shared_rows: rows of another block ``B``, the second argument, that several blocks may share.
+        lane_index: name of the lane's number; `INDEPENDENT_INDEX` where the layout has expressions.
 
     Raises:
         ValueError: for a name that is neither assigned, nor a row, nor uniform.
@@ -136,7 +138,7 @@ def print_lane_loop(
     def entry(row: str) -> str:
         """A row's entry; the adjoint of a row, ``ADJ_<row>``, lies in the same place of the block ``A``."""
         if shared_rows and row in shared_rows:
-            return f"B[{shared_rows[row] * lanes}{' + LANE' if lanes > 1 else ''}]"
+            return f"B[{shared_rows[row] * lanes}{f' + {lane_index}' if lanes > 1 else ''}]"
         block, bare = ("W", row) if row in layout else ("A", row.removeprefix("ADJ_"))
         if bare not in layout:
             raise ValueError(
@@ -144,15 +146,15 @@ def print_lane_loop(
             )
         row_number = layout[bare]
         start = str(row_number * lanes) if isinstance(row_number, int) else f"({row_number}) * {lanes}"
-        return f"{block}[{start}{' + LANE' if lanes > 1 else ''}]"
+        return f"{block}[{start}{f' + {lane_index}' if lanes > 1 else ''}]"
 
     body = [f"{row} = {entry(row)}" for row in read]
     body += [f"{target} = {print_expression(e)}" for target, e in kept]
     body += [f"{entry(row)} = {value}" for row, value in results.items()]
-    blocks = ["W", *(["A"] if adjoint else []), *(["B"] if shared_rows else []), *(["LANE"] if single_lane else [])]
+    blocks = ["W", *(["A"] if adjoint else []), *(["B"] if shared_rows else []), *([lane_index] if single_lane else [])]
     source = ["@scalar_jit", f"def {name}({', '.join([*blocks, *uniform])}):", f'    """{doc}"""']
     if lanes > 1 and not single_lane:
-        source.append(f"    for LANE in range({lanes}):")
+        source.append(f"    for {lane_index} in range({lanes}):")
     indent = "        " if lanes > 1 and not single_lane else "    "
     return "\n".join(source + [indent + line for line in body]) + "\n"
 

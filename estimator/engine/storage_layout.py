@@ -7,7 +7,12 @@ from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 from estimator.compilation.simd import number_rows
+from estimator.models.expression import names_in, parse
 from estimator.models.model import MAX_INPUT_AGE, Model
+
+#: Number of states from which the record likelihood is written as loops over packed arrays. With fewer, straight lines
+#: compile in as little time and run faster (`benchmarks.compile_time`).
+MIN_PACKED_STATES = 5
 
 
 def upper_triangle_names(matrix: str, names: Iterable[str]) -> list[str]:
@@ -203,3 +208,51 @@ def linearised_filter_layout(
     ]
     given += ["SAMPLE_LENGTH"] if variable_step else []
     return number_rows(*linearised_filter_rows(model), *likelihood_total_rows(model), *given, *integrator_rows(model))
+
+
+def is_packed(model: Model) -> bool:
+    """Whether a model's linearised filter is written as loops over packed arrays (`estimator.engine.packed_filter`)."""
+    return model.n_states >= MIN_PACKED_STATES
+
+
+def slope_entries(model: Model) -> list[tuple[str, str]]:
+    """Entries (state, quantity) of the Jacobian of the rates or next states that may differ from 0."""
+    used = [names_in(parse(text, model.name)) for text in model.update_expressions]
+    return [(i, j) for i, names in zip(model.states, used, strict=True) for j in model.dynamic_names if j in names]
+
+
+def packed_rows(model: Model) -> list[str]:
+    """Rows between the steps of a packed filter, matrix after matrix, each row by row.
+
+    ===================  ==============================================================================
+    ``RATE_i``           rate of state i at a stage; ``STATE_END_i`` the state at the end of the step
+    ``EFFECT_s_i``       effect of the process noise on state i at stage s
+    ``SLOPE_s_i_j``      Jacobian of the rates at stage s: the entries that may differ from 0
+    ``END_BY_i_j``       derivative of the step's end by quantity j; ``IDENTITY_i_k`` the unit matrix
+    ``F_i_j``            F, here for a difference equation only
+    ``COV_i_k``          the covariance, square, or the process noise's at a stage
+    ``PRODUCT_i_k``      a Jacobian times it
+    ``NOISE_i_k``        Q, its upper triangle; ``NOISE_END_i_k`` at the end of the step
+    ``MEAN_i``           mean of state i; ``CROSS_COV_i`` its covariance with a sensor's output
+    ``OUTPUT_BY_c``      derivative of a sensor's output by coefficient c
+    ===================  ==============================================================================
+    """
+    states, movers, n_stages = list(model.states), list(model.dynamic_names), 4
+
+    def square(letter: str, columns: Iterable[str] = states) -> list[str]:
+        return [f"{letter}_{i}_{j}" for i in states for j in list(columns)]
+
+    def by_stage(letter: str, names: Iterable[str]) -> list[str]:
+        return [f"{letter}_{s}_{name}" for s in range(n_stages) for name in list(names)]
+
+    rows = [] if model.is_continuous else square("F", movers)
+    if model.is_continuous:
+        rows += [f"RATE_{i}" for i in states] + [f"STATE_END_{i}" for i in states]
+        rows += by_stage("SLOPE", [f"{i}_{j}" for i, j in slope_entries(model)]) + by_stage("EFFECT", states)
+        rows += square("IDENTITY") + square("END_BY", movers)
+        rows += [f"HELD_END{r}_{i}" for r in range(len(held_noise_rows(model))) for i in states]
+        rows += square("NOISE_END")
+    rows += square("COV") + square("PRODUCT") + square("NOISE")
+    rows += [f"{letter}_{i}" for letter in ("MEAN", "CROSS_COV") for i in states]
+    rows += [f"OUTPUT_BY_{c}" for c in model.coefficients]
+    return [*rows, "S_INVERSE", "S_INVERSE_COUNTED", "INNOVATION", *(f"OUTPUT_SLOPE_{i}" for i in model.names)]
