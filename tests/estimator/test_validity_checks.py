@@ -191,7 +191,7 @@ def test_short_steps_that_a_converter_held_are_no_blows():
 
 def test_a_search_that_failed_is_no_wrong_equation(monkeypatch):
     record = simulated(WELLS, 7, 1024, kind="acceleration", start=np.sqrt(2500.0 / 4e7))
-    monkeypatch.setattr(sys.modules["estimator.identification.fitting.multistart_search"], "_MAX_RESTARTS", 0)
+    monkeypatch.setattr(sys.modules["estimator.identification.fitting.multistart_search"], "_MAX_ROUNDS", 0)
     (warning,) = identify(rig_of(WELLS, "acceleration"), record).warnings
     assert warning.name == "search_failed"
     assert "the search may have failed" in warning.message

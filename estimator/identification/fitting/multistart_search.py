@@ -11,7 +11,12 @@ import numpy as np
 from estimator.identification.fitting.noise_ratio_fit import fit_noise_ratio
 from estimator.identification.fitting.profile_likelihood import profile_posterior
 from estimator.identification.fitting.search_result import SearchResult
-from estimator.identification.fitting.starting_points import fit_first_starts, fit_random_starts
+from estimator.identification.fitting.starting_points import (
+    first_noise_ratios,
+    fit_first_starts,
+    fit_random_starts,
+    refit_from_initial_states,
+)
 from estimator.identification.likelihood.fit_hypothesis import CoefficientPrior, LaplaceFits
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
@@ -29,8 +34,14 @@ _WIDE_PRIOR_FACTOR = 30.0
 #: Disturbance of a good result, as a fraction of the input, at most; above it other starts are drawn.
 _MAX_GOOD_DISTURBANCE = 0.05
 
+#: Random starts in a round. Rounds are small, because few starts are often enough.
+_STARTS_PER_ROUND = 48
+
 #: Rounds of random starts, at most.
-_MAX_RESTARTS = 3
+_MAX_ROUNDS = 24
+
+#: Rounds after which a start that leads to the best result again ends the search.
+_ROUNDS_BEFORE_AGREEMENT = 8
 
 #: Difference of the free energies of equal optima, at most [nats].
 _SAME_OPTIMUM_NATS = 5.0
@@ -101,20 +112,30 @@ def search_coefficients(problem: ScaledRecords, on_progress: ProgressCallback) -
 def _restart_and_settle(fitter: LaplaceFitter, first_result: SearchResult) -> SearchResult:
     """The best of a poor result and of results from random starts.
 
-    Where the two best agree, the start is not the fault. A result that is not poor ends the search too.
+    A result that is not poor ends the search. After some rounds, so does a start that leads to the best result again:
+    then the start is not the fault. Only fits that are better than the best result's are settled.
     """
     energy = lambda end: float(end.fits.free_energy.min())  # noqa: E731
-    results = [first_result]
-    for seed in range(_MAX_RESTARTS):
-        random_fits = fit_random_starts(fitter, seed)
-        for k in range(len(random_fits.mean)):
+    best, bar, is_found_again = first_result, _comparable_free_energy(fitter, first_result), False
+    for seed in range(_MAX_ROUNDS):
+        fits = fit_random_starts(fitter, _STARTS_PER_ROUND, seed)
+        found = float(fits.free_energy[0]) if len(fits.mean) else np.inf
+        is_found_again |= abs(found - bar) < _SAME_OPTIMUM_NATS
+        if found < bar - _SAME_OPTIMUM_NATS:
             with suppress(ValueError):  # it diverged
-                results.append(_settle_best_start(fitter, random_fits.select(np.array([k]))))
-            results.sort(key=energy)
-            is_same_optimum = len(results) > 1 and energy(results[1]) < energy(results[0]) + _SAME_OPTIMUM_NATS
-            if is_same_optimum or results[0].relative_disturbance < _MAX_GOOD_DISTURBANCE:
-                return results[0]
-    return replace(results[0], has_failed=True)
+                result = _settle_best_start(fitter, fits)
+                if energy(result) < energy(best):
+                    best, bar, is_found_again = result, found, False
+        is_poor = best.relative_disturbance > _MAX_GOOD_DISTURBANCE
+        if not is_poor or (is_found_again and seed + 1 >= _ROUNDS_BEFORE_AGREEMENT):
+            return best
+    return replace(best, has_failed=True)
+
+
+def _comparable_free_energy(fitter: LaplaceFitter, result: SearchResult) -> float:
+    """The free energy of a result at the noise ratios and initial states of fits from random starts."""
+    fits = refit_from_initial_states(fitter, result.fits.lowest_free_energy(1), first_noise_ratios(fitter.problem), 1)
+    return float(fits.free_energy[0]) if len(fits.mean) else np.inf
 
 
 def _settle_best_start(fitter: LaplaceFitter, start_fits: LaplaceFits) -> SearchResult:

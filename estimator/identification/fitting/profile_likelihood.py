@@ -70,7 +70,7 @@ def profile_posterior(
         start.select(np.zeros_like(all_walks)),
         np.full(len(which), GAUSSIAN_CHECK_STDS),
     )
-    if not is_surprising and is_gaussian(walk, walk.fit_step(all_walks, (1.0,), SCREENING_ITERATIONS)):
+    if not is_surprising and is_gaussian(walk, walk.fit_step(all_walks, (), SCREENING_ITERATIONS)):
         return None
     walked, walkers = walk.walk_outward(min(float(one.loss.min()) for one in (start, *leap_fits.values())))
     ridges = {}

@@ -45,7 +45,11 @@ _STEP_GROWTH = 1.7
 _STEP_SHRINKAGE = 0.4
 
 #: Factors of the noise ratio that are tried at each step.
-_WALK_RATIO_FACTORS = (0.2, 1.0, 5.0)
+_WALK_RATIO_FACTORS = (0.2, 5.0)
+
+#: Free energy above the fit at the ratio of the step before, above which the fit at another ratio ends [nats]. It
+#: allows for the covariance, which counts in a free energy but not in a loss.
+_MAX_RATIO_NATS = 10.0
 
 #: Steps of a fit in the Gaussian check and in the screening of leaps.
 SCREENING_ITERATIONS = 3
@@ -120,19 +124,31 @@ class RidgeWalk:
         return ahead, slopes
 
     def fit_step(self, walks: npt.NDArray[np.intp], ratio_factors: Sequence[float], iterations: int) -> LaplaceFits:
-        """The fits of some walks after the next step, each at the best of several noise ratios."""
+        """The fits of some walks after the next step, at the noise ratio so far or at a better one.
+
+        Args:
+            walks: indices of the walks.
+            ratio_factors: factors of the other noise ratios that are tried.
+            iterations: steps of a fit, at most.
+        """
         ahead, slopes = self.predict_step(walks)
+        hypotheses = [self.current.hypotheses[i] for i in walks]
+        fits = self.fitter.fit(hypotheses, ahead, self.current.sensor_std[walks], iterations, fixed_directions=slopes)
+        if not ratio_factors:
+            return fits
         n = len(ratio_factors)
-        hypotheses = [
-            replace(self.current.hypotheses[i], noise_ratio=self.current.hypotheses[i].noise_ratio * factor)
-            for i in walks
-            for factor in ratio_factors
-        ]
-        levels = np.repeat(self.current.sensor_std[walks], n)
-        fits = self.fitter.fit(
-            hypotheses, np.repeat(ahead, n, axis=0), levels, iterations, fixed_directions=np.repeat(slopes, n, axis=0)
+        others = self.fitter.fit(
+            [replace(one, noise_ratio=one.noise_ratio * factor) for one in hypotheses for factor in ratio_factors],
+            np.repeat(fits.mean, n, axis=0),
+            np.repeat(fits.sensor_std, n),
+            iterations,
+            give_up_above=np.repeat(fits.free_energy + _MAX_RATIO_NATS, n),
+            fixed_directions=np.repeat(slopes, n, axis=0),
         )
-        return fits.select(np.arange(len(walks)) * n + finite_losses(fits).reshape(-1, n).argmin(axis=1))
+        tried = np.column_stack([finite_losses(fits), finite_losses(others).reshape(-1, n)]).argmin(axis=1)
+        rows = np.arange(len(walks))
+        chosen = np.where(tried == 0, rows, len(rows) + rows * n + tried - 1)
+        return LaplaceFits.concatenated([fits, others]).select(chosen)
 
     def walk_outward(self, lowest_loss: float) -> tuple[LaplaceFits, npt.NDArray[np.intp]]:
         """Walk until the loss is large; all fits on the way, and the index of the walk of each."""

@@ -10,6 +10,7 @@ from estimator.identification.fitting.weak_form import random_starts, weak_form_
 from estimator.identification.likelihood.fit_hypothesis import FitHypothesis, LaplaceFits, with_noise_ratios
 from estimator.identification.likelihood.initial_states import find_initial_states
 from estimator.identification.likelihood.laplace_fit import LaplaceFitter
+from estimator.identification.likelihood.scaled_records import ScaledRecords
 from estimator.rigs.physical_parameters import coefficients_of
 from estimator.support.array_types import FloatArray
 
@@ -32,7 +33,7 @@ _WEAK_FORM_PERIODS = 40
 #: Stages of the first fits: steps, and number of fits that are kept.
 _FIRST_SEARCH_STAGES = ((3, 8), (10, 1))
 
-#: Random starts in a round.
+#: Random starts on each segment where there is no other start.
 _N_RANDOM_STARTS = 192
 
 #: Periods in the first segments that random starts are fitted to.
@@ -47,8 +48,8 @@ _SEGMENT_GROWTH = 4
 #: Steps of a fit from a random start.
 _RESTART_FIT_STEPS = 8
 
-#: Results that are kept of random starts, of segments, and of all records.
-_N_KEPT_STARTS = (48, 12, 3)
+#: Random starts for each that is kept after the first segments, and after longer ones.
+_STARTS_PER_KEPT = (4, 16)
 
 #: Steps of the fits to all records that confirm a start.
 _CONFIRMING_FIT_STEPS = 3
@@ -68,8 +69,8 @@ def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
         guessed = coefficients_of(problem.model, middle, problem.scales)
         candidates.append(problem.moments_about_origin(guessed, np.zeros((len(guessed),) * 2))[0])
     if not candidates:
-        return fit_random_starts(fitter)
-    ratios = _INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order)
+        return _fit_many_random_starts(fitter)
+    ratios = first_noise_ratios(problem)
     base = FitHypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[len(ratios) // 2]), lag=problem.lag)
     sensor_std = np.array(0.1 * problem.output_rms)
     initial_states = find_initial_states(short_fitter.problem, base, np.array(candidates), float(sensor_std))
@@ -86,38 +87,42 @@ def fit_first_starts(fitter: LaplaceFitter) -> LaplaceFits:
         fits = fitter.fit(
             list(fits.hypotheses) * len(points), points, fits.sensor_std[0], _CONFIRMING_FIT_STEPS
         ).lowest_free_energy(1)
-    return fits if np.isfinite(fits.free_energy).any() else fit_random_starts(fitter)
+    return fits if np.isfinite(fits.free_energy).any() else _fit_many_random_starts(fitter)
 
 
-def fit_random_starts(fitter: LaplaceFitter, seed: int = 0) -> LaplaceFits:
-    """The best fits from random starts, fitted to growing segments of the records."""
+def _fit_many_random_starts(fitter: LaplaceFitter) -> LaplaceFits:
+    """The best fit from many random starts."""
+    rounds = [fit_random_starts(fitter, _N_RANDOM_STARTS, seed) for seed in range(2)]
+    return LaplaceFits.concatenated(rounds).lowest_free_energy(1)
+
+
+def fit_random_starts(fitter: LaplaceFitter, count: int, seed: int) -> LaplaceFits:
+    """The best fit from random starts, fitted to growing segments of the records; no fit where all diverge.
+
+    Args:
+        fitter: fitter of the records.
+        count: number of starts.
+        seed: of the starts. An even one begins where the input acts, an odd one where the outputs are largest.
+    """
     problem = fitter.problem
-    ratios = _INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order)
+    ratios = first_noise_ratios(problem)
     base = FitHypothesis(problem.rig.interpolation, problem.rig.delay, float(ratios[2]), lag=problem.lag)
-    shortest = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_PERIODS * 2 * np.pi / problem.mean_frequency))
-    points = np.array(random_starts(problem, _N_RANDOM_STARTS, seed))
-    shape, levels = (_N_RANDOM_STARTS, *np.diag(points[0]).shape), np.full(_N_RANDOM_STARTS, 0.1 * problem.output_rms)
-    random_fits = LaplaceFits(
-        (base,) * _N_RANDOM_STARTS, points, np.zeros(shape), levels, *np.zeros((2, _N_RANDOM_STARTS))
-    )
-    found = []
-    for segment in dict.fromkeys(
-        [problem.largest_output_segment(shortest), *problem.most_driven_segments(shortest)[:1]]
-    ):
-        samples, (n_first, n_later, _) = shortest, _N_KEPT_STARTS
-        fits = _fit_from_initial_states(
-            fitter.for_problem(problem.with_segments([segment], samples)), random_fits, ratios[[1, 3]], n_first
-        )
-        while samples < max(map(len, problem.u)):
-            fits = _fit_from_initial_states(
-                fitter.for_problem(problem.with_segments([segment], samples)), fits, ratios, n_later
-            )
-            samples *= _SEGMENT_GROWTH
-        found.append(fits)
-    return _fit_from_initial_states(fitter, LaplaceFits.concatenated(found), ratios, _N_KEPT_STARTS[2])
+    samples = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_PERIODS * 2 * np.pi / problem.mean_frequency))
+    segment = problem.largest_output_segment(samples) if seed % 2 else problem.most_driven_segments(samples)[0]
+    points = np.array(random_starts(problem, count, seed))
+    shape, levels = (count, *np.diag(points[0]).shape), np.full(count, 0.1 * problem.output_rms)
+    fits = LaplaceFits((base,) * count, points, np.zeros(shape), levels, *np.zeros((2, count)))
+    n_first, n_later = (count // part for part in _STARTS_PER_KEPT)
+    shortened = fitter.for_problem(problem.with_segments([segment], samples))
+    fits = refit_from_initial_states(shortened, fits, ratios[[1, 3]], n_first)
+    while samples < max(map(len, problem.u)):
+        shortened = fitter.for_problem(problem.with_segments([segment], samples))
+        fits = refit_from_initial_states(shortened, fits, ratios, n_later)
+        samples *= _SEGMENT_GROWTH
+    return refit_from_initial_states(fitter, fits, ratios, 1)
 
 
-def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: FloatArray, n_kept: int) -> LaplaceFits:
+def refit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: FloatArray, n_kept: int) -> LaplaceFits:
     """The best ``n_kept`` of further fits from earlier ones, with new initial states and the best of several ratios."""
     if not len(fits.mean):
         return fits
@@ -130,6 +135,11 @@ def _fit_from_initial_states(fitter: LaplaceFitter, fits: LaplaceFits, ratios: F
     tried = fitter.fit(hypotheses, points, levels, _RESTART_FIT_STEPS)
     of_each = tried.free_energy.reshape(-1, len(ratios)).argmin(axis=1)
     return _distinct_optima(tried.select(len(ratios) * np.arange(len(of_each)) + of_each), n_kept)
+
+
+def first_noise_ratios(problem: ScaledRecords) -> FloatArray:
+    """(5,) noise ratios of first fits."""
+    return np.asarray(_INITIAL_NOISE_RATIOS * problem.mean_frequency ** (2 - problem.scales.order))
 
 
 def _distinct_optima(fits: LaplaceFits, max_count: int) -> LaplaceFits:

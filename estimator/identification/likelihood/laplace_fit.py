@@ -116,7 +116,7 @@ class LaplaceFitter:
         initial_coefficients: FloatArray,
         initial_sensor_std: FloatArray | float,
         iterations: int = 30,
-        give_up_above: float = np.inf,
+        give_up_above: FloatArray | float = np.inf,
         fixed_directions: FloatArray | None = None,
     ) -> LaplaceFits:
         """Fit each hypothesis by damped Gauss-Newton steps (Levenberg-Marquardt).
@@ -126,7 +126,7 @@ class LaplaceFitter:
             initial_coefficients: (K,) or (H, K) coefficients to start from.
             initial_sensor_std: σ_v to start from, one or (H,).
             iterations: steps, at most.
-            give_up_above: free energy; the fit of a hypothesis that cannot come below it ends.
+            give_up_above: free energy, one or (H,); the fit of a hypothesis that cannot come below it ends.
             fixed_directions: (H, K) directions whose products with the coefficients no step changes. Covariances and
                 free energies do not take them into account.
         """
@@ -136,9 +136,9 @@ class LaplaceFitter:
         sensor_stds = np.broadcast_to(np.asarray(initial_sensor_std, dtype=np.float64), count)
         filter_inputs = self._filter_inputs(hypotheses)
         loss, gradient, curvature, sensor_stds = self._loss_and_derivatives(points, filter_inputs, sensor_stds)
-        damping = np.full(count, _INITIAL_DAMPING)
+        damping, bars = np.full(count, _INITIAL_DAMPING), np.broadcast_to(give_up_above, count)
         active = np.flatnonzero(np.isfinite(loss))
-        for _ in range(iterations):
+        for n_steps in range(iterations):
             if not len(active):
                 break
             damped = curvature[active] + (damping[active, None] * np.einsum("hii->hi", curvature[active]))[
@@ -150,6 +150,11 @@ class LaplaceFitter:
                 else solve_with_fixed_directions(damped, gradient[active], scaled_directions[active])
             )
             predicted = -0.5 * np.einsum("hk,hk->h", gradient[active], step)
+            if n_steps == 0:
+                can_win = ~self._is_lost(loss[active], curvature[active], predicted, bars[active])
+                active, step, predicted = active[can_win], step[can_win], predicted[can_win]
+                if not len(active):
+                    break
             trial = points[active] + self._scale * step
             found = self._loss_and_derivatives(trial, filter_inputs.of(active), sensor_stds[active])
             better = found[0] <= loss[active]  # False for a loss that is not finite
@@ -167,7 +172,7 @@ class LaplaceFitter:
             is_finished = (
                 (predicted < _MIN_PREDICTED_GAIN)
                 | (damping[active] > _MAX_DAMPING)
-                | (self._free_energy(loss[active], curvature[active]) - _REMAINING_GAIN_FACTOR * gained > give_up_above)
+                | self._is_lost(loss[active], curvature[active], gained, bars[active])
             )
             active = active[~is_finished]
         cov = invert_batch(curvature) * np.outer(self._scale, self._scale)
@@ -259,6 +264,14 @@ class LaplaceFitter:
         """(H,) free energies; inf where one is not finite."""
         log_det = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(self._in_prior_units(self.prior.precision))[1]
         return np.where(np.isfinite(loss + log_det), loss + 0.5 * log_det, np.inf)
+
+    def _is_lost(
+        self, loss: FloatArray, curvature: FloatArray, last_gain: FloatArray, bars: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """(H,) whether fits cannot come below the free energies ``bars`` any more."""
+        if np.isposinf(bars).all():
+            return np.zeros(len(loss), dtype=np.bool_)
+        return np.asarray(self._free_energy(loss, curvature) - _REMAINING_GAIN_FACTOR * last_gain > bars)
 
     def _in_prior_units(self, precision: FloatArray) -> FloatArray:
         """A precision of the coefficients, in units of the prior's standard deviations."""
