@@ -4,6 +4,7 @@ from .identification import identify
 from .identification.identification_result import Result
 from .inference.fisher_information import cramer_rao, fisher_information, relative_covariance
 from .inference.noise_grid import NoiseRatio
+from .inference.noise_profile import profile_noises
 from .inference.pem_narx import PEMNARX
 from .models.difference_equation import difference
 from .models.duffing import duffing
@@ -38,6 +39,7 @@ __all__ = [
     "identify",
     "load_estimator",
     "paper_text_prior",
+    "profile_noises",
     "published_run_prior",
     "recorded_prior",
     "relative_covariance",
