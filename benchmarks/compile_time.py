@@ -68,13 +68,15 @@ def main(config: Config) -> None:
 
 def first_likelihood(tree: Path, states: int) -> Callable[[int], tuple[float, float]]:
     """A row's ``run``: the seconds of a chain in a version's tree, with nothing cached."""
+    script = Path(__file__).with_name("compile_time_row.py")
+    # An installed version must not come before the tree's.
+    code = f"import runpy, sys; sys.path.insert(0, {str(tree)!r}); runpy.run_path({str(script)!r}, run_name='__main__')"
 
     def run(_: int) -> tuple[float, float]:
         with tempfile.TemporaryDirectory() as empty:
             done = subprocess.run(
-                [sys.executable, "-P", Path(__file__).with_name("compile_time_row.py"), str(states)],
-                cwd=tree, env={**os.environ, "NUMBA_CACHE_DIR": empty, "PYTHONPATH": str(tree)},
-                capture_output=True, text=True,
+                [sys.executable, "-P", "-c", code, str(states)],
+                cwd=tree, env={**os.environ, "NUMBA_CACHE_DIR": empty}, capture_output=True, text=True,
             )  # fmt: skip
         if done.returncode:
             raise RuntimeError(done.stderr.strip().splitlines()[-1])
