@@ -140,8 +140,9 @@ class CustomFunctions:
             Beliefs(self._model, records, scales) for records in (self._records_before, batch.records(ended))
         )
         first_sensor = next(iter(batch.experiment.truth_model.outputs))
-        u, y = batch.applied_inputs(ended) * scales.input, batch.row_matrix([f"Y_{first_sensor}"], ended)[:, 0]
-        u, y = u[:, 0] if u.shape[1] == 1 else u, y * scales.output
+        u, y = batch.applied_inputs(ended), batch.row_matrix([f"Y_{first_sensor}"], ended)[:, 0]
+        u, y = u * scales.input_scales(u.shape[1]), y * scales.output
+        u = u[:, 0] if u.shape[1] == 1 else u
         truth = batch.truth(ended) if batch.experiment.knows_truth else None
         if hasattr(self._reward, "py_func"):  # compiled by Numba
             paid = np.empty(n)

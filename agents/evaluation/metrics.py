@@ -86,15 +86,15 @@ def input_metrics(inputs: FloatArray) -> dict[str, FloatArray]:
 def fisher_information_gain(
     inputs: FloatArray, truth: Parameters, experiment: SimulatedExperiment, outputs: FloatArray | None = None
 ) -> FloatArray:
-    """Information gain (n,) of an efficient estimator from inputs (T, n): ½ log det(Λ0 + F) - ½ log det Λ0 [nats].
+    """Information gain (n,) of an efficient estimator: ½ log det(Λ0 + F) - ½ log det Λ0 [nats].
 
-    F is the Fisher information at the true coefficients of the plant's equation, along the measured outputs (T, n) or
-    (T, n, sensors), or along the response without noise; Λ0 is the inverse covariance of the prior from which the
-    plants are drawn.
+    Inputs are (T, n), or (T, n, inputs) of several. F is the Fisher information at the true coefficients of the plant's
+    equation, along the measured outputs (T, n) or (T, n, sensors), or along the response without noise; Λ0 is the
+    inverse covariance of the prior from which the plants are drawn.
     """
     plant = plant_model_of(experiment, truth)
     F = fisher_information(
-        plant.model, plant.coefficients_of(truth), inputs.T, plant.process_noise, plant.sensor_noises,
+        plant.model, plant.coefficients_of(truth), np.swapaxes(inputs, 0, 1), plant.process_noise, plant.sensor_noises,
         interpolation=plant.interpolation, y=None if outputs is None else np.swapaxes(outputs, 0, 1),
     )  # fmt: skip
     cov = plant.prior.coefficients_cov

@@ -82,6 +82,11 @@ class PlayedEpisodes(NamedTuple):
     experiment: Experiment
 
 
+def one_channel(series: FloatArray) -> FloatArray:
+    """A series (T, n, channels), without the last axis where there is one channel."""
+    return series[..., 0] if series.shape[-1] == 1 else series
+
+
 def run_episodes(
     name: PolicySpec,
     env_id: str,
@@ -105,13 +110,13 @@ def run_episodes(
     prior, beliefs = trace.prior, trace.beliefs
     means = np.array([belief.coefficients_mean for belief in beliefs])
     covs = np.array([belief.coefficients_cov for belief in beliefs])
-    inputs, outputs = (series[..., 0] if series.shape[-1] == 1 else series for series in (trace.inputs, trace.outputs))
+    inputs, outputs = one_channel(trace.inputs), one_channel(trace.outputs)
     values = {
         "information_gain": np.array([prior.entropy() - belief.entropy() for belief in beliefs]),
         "log_posterior_gain": trace.gain_curve[-1],
         **metrics.posterior_metrics(means, covs, truth, prior.model, prior.scales),
         "ended_early": trace.ended_early,
-        **metrics.input_metrics(prior.scales.input * inputs),
+        **metrics.input_metrics(one_channel(trace.inputs * prior.scales.input_scales(prior.model.n_inputs))),
         # Processor time. The first call may compile, and counts where there is no other.
         "decision_time": np.full(systems, np.mean(trace.decision_times[1:] or trace.decision_times) / systems),
     }

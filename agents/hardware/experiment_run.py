@@ -277,8 +277,10 @@ def _join_messages(*messages: str) -> str:
 def _prior_conflict_warning(rig: Rig, belief: Belief, samples_path: Path) -> str:
     """A warning where the samples contradict the prior, so that the belief explains them by noise; else an empty text.
 
-    A belief that is sure of wrong coefficients keeps them.
+    A belief that is sure of wrong coefficients keeps them. Only of one input is it known which force the noise is.
     """
+    if len(rig.inputs) > 1 or "gain" not in belief.model.coefficients:
+        return ""
     with samples_path.open(encoding="utf-8") as lines:
         if sum(1 for _ in lines) <= _MIN_OUTPUTS_FOR_NOISE:
             return ""
@@ -300,10 +302,12 @@ def _compile_ahead(
     settings: RunSettings,
 ) -> None:
     """Compile the functions that the run will call: a plant must not wait for the compiler with its input on."""
-    env_view.belief, rng = run_estimator.predict_ahead(0.0), np.random.default_rng(0)
+    no_input = np.zeros(len(env_view.max_inputs))
+    env_view.belief = run_estimator.predict_ahead(no_input if len(no_input) > 1 else 0.0)
+    rng = np.random.default_rng(0)
     if designer is None:
         # A missing output takes more steps than a measured one.
-        policy.predict(env_view.observation(0.0, np.nan, 0), None, deterministic=True)
+        policy.predict(env_view.observation(no_input, np.nan, 0), None, deterministic=True)
         return
     futures = MonteCarloSystems(run_estimator.online.model, run_estimator.draw_systems(rng), 1.0, rng)
     if settings.block:

@@ -36,11 +36,11 @@ def inputs_from_policy(policy: Policy, env_view: EnvView, run_estimator: RunEsti
 
     def next_input(k: int, u: InputValue, y: float) -> InputValue:
         nonlocal state
-        scales = run_estimator.online.scales
+        scales, sizes = run_estimator.online.scales, run_estimator.online.scales.input_scales(len(env_view.max_inputs))
         env_view.belief = run_estimator.predict_ahead(u)
-        observation = env_view.observation(u / scales.input, y / scales.output, k)
+        observation = env_view.observation(u / sizes, y / scales.output, k)
         action, state = policy.predict(observation, state, deterministic=True)
-        chosen = action.astype(np.float64) * env_view.max_inputs * scales.input
+        chosen = action.astype(np.float64) * env_view.max_inputs * sizes
         return chosen.item() if len(chosen) == 1 else chosen
 
     return next_input

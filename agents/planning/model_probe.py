@@ -108,7 +108,7 @@ class LocalDynamics(NamedTuple):
     Attributes:
         outputs_shown: (n,) outputs of the first sensor.
         velocities: (n,) their velocities.
-        input_gains: (n,) the gain (`estimator.engine.noise_free_step`).
+        input_gains: (n,) the gain (`estimator.engine.noise_free_step`); of several inputs, which change alike.
         jacobians: (n, states, states) of the linear part.
         regressors: (n, K) derivatives of the motion over a sample by the coefficients.
     """
@@ -130,7 +130,8 @@ def _compile_local_dynamics(model: Model) -> Any:
         free_response.linearise,
         free_response.regressors,
     )
-    n, k, size, u = model.n_states, model.n_coefficients, len(at), at[only_input_rows(model)[0]]
+    n, k, size = model.n_states, model.n_coefficients, len(at)
+    input_rows = np.array([at[input_history_row(name, 0)] for name in model.inputs])
     now, velocity, gain = at["NOW"], at["VELOCITY"], at["GAIN"]
     state, coefficient = next(iter(model.states)), next(iter(model.coefficients))
     linear, first = at[f"A_{state}_{state}"], at[f"REGRESSOR_{coefficient}"]
@@ -141,7 +142,8 @@ def _compile_local_dynamics(model: Model) -> Any:
         for i in range(len(means)):
             copy(W, 0, states[i], n)
             copy(W, n, means[i], k)
-            W[u] = inputs
+            for row in input_rows:
+                W[row] = inputs
             sense(W)
             linearise(W)
             regress(W)
@@ -161,7 +163,7 @@ def probe_dynamics(model: Model, means: npt.ArrayLike, states: npt.ArrayLike, u:
         model: of all systems.
         means: (n, K) their coefficients.
         states: (n, states) their states.
-        u: the input.
+        u: the input, or each of several.
     """
     coefficient_rows = np.ascontiguousarray(np.atleast_2d(means), dtype=np.float64)
     state_rows = np.ascontiguousarray(np.atleast_2d(states), dtype=np.float64)

@@ -80,7 +80,10 @@ class EpisodeRenderer:
         names = shown_parameters(belief.model)
         self._truth = np.array([getattr(truth, name, np.nan) for name in names])
         self._labels = _axis_labels(belief)
-        self._input_units = {name: unit or self._scales.input_unit for name, unit in belief.model.inputs.items()}
+        units = dict(zip(belief.model.inputs, self._scales.input_units(belief.model.n_inputs), strict=True))
+        # Channels by name have units of their own, in which the inputs are shown.
+        stated = {} if self._scales.more_inputs else belief.model.inputs
+        self._input_units = {name: stated.get(name) or unit for name, unit in units.items()}
         self._model = (
             "Duffing oscillator" if tuple(names) == tuple(_PARAMETER_LABELS) else belief.model.name.replace("_", " ")
         )
@@ -97,7 +100,8 @@ class EpisodeRenderer:
     def add_sample(self, u: float | FloatArray, y: float, belief: Belief) -> None:
         """Add a sample: applied inputs (inputs,), the output after them, in internal units, and the belief after it."""
         self._samples += 1
-        self._history.append((np.atleast_1d(self._scales.input * u), self._scales.output * y, belief))
+        inputs = np.atleast_1d(u) * self._scales.input_scales(belief.model.n_inputs)
+        self._history.append((inputs, self._scales.output * y, belief))
         self._show()
 
     def frame(self) -> Frame:
@@ -202,7 +206,8 @@ class _EpisodeFigure:
             input_title = _with_unit(f"input {next(iter(max_inputs))}", next(iter(input_units.values())))
         else:
             input_title = "inputs in parts of their limits"
-        input_limits = {name: scales.input * u for name, u in max_inputs.items()}
+        sizes = scales.input_scales(len(max_inputs)).tolist()
+        input_limits = {name: size * u for (name, u), size in zip(max_inputs.items(), sizes, strict=True)}
         input_limits = {f"{name} (±{u:.4g} {input_units[name]})": u for name, u in input_limits.items()}
         y = _with_unit("output y", scales.output_unit)
         height = _PARAMETER_PANELS_HEIGHT / len(labels)

@@ -23,6 +23,7 @@ from estimator.belief import Belief
 from estimator.inference.noise_grid import NoiseGridSize
 from estimator.models.model import Model
 from estimator.models.named_parameters import Parameters
+from estimator.rigs.channel import Channel
 from estimator.rigs.rig import Rig
 from estimator.rigs.rig_prior import equal_effect_log_ratio, reset_state, rig_prior
 from estimator.rigs.units import Scales
@@ -66,7 +67,11 @@ def playable_rig(rig: RigLike | None, needs_guess: bool = True) -> Rig:
     if rig is None:
         raise ValueError("rig must be a Rig, a dictionary or a file name, but is None; pass rig='rig.toml'")
     rig = Rig.from_any(rig)
-    needed = {"input.limit": rig.only_input.limit, "output.range": rig.output.range, "guess": rig.guess}
+    several = not isinstance(rig.input, Channel)
+    needed: dict[str, object] = {
+        f"input.{name}.limit" if several else "input.limit": one.limit for name, one in rig.inputs.items()
+    }
+    needed |= {"output.range": rig.output.range, "guess": rig.guess}
     for name, given in needed.items():
         if given is None and (needs_guess or name != "guess"):
             raise ValueError(f"rig must have {name} to be played, but has none; add it to the rig")
@@ -146,6 +151,7 @@ class RigPlantExperiment(RigScaling, Experiment):
         object.__setattr__(self, "rig", playable_rig(self.rig, self.prior is None))
         if self.prior is not None:
             check_prior(self.prior, self.scales)
+            self.validated_rig.check_inputs_of(self.prior.model)
         # A posterior has the state at the end of its record, but the plant is brought to rest.
         prior = rig_prior(self.validated_rig) if self.prior is None else reset_state(self.prior)
         object.__setattr__(self, "prior", prior)
@@ -272,7 +278,7 @@ class RigPlantEnv(DuffingEnv):
             )
         scales = self.experiment.scales
         u = self.experiment.max_inputs * np.float32(action).astype(np.float64)
-        given = scales.input * u
+        given = scales.input_scales(len(u)) * u
         try:
             y = as_number("step", self.plant.step(given.item() if len(given) == 1 else given)) / scales.output
         except Exception as error:  # any error ends the episode in order, with its belief

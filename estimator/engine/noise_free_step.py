@@ -5,7 +5,8 @@ These quantities exist for every model:
 - the *velocity*: the time derivative of the first sensor's output without input. For a difference equation with the
   last output among its states it is the change since the last sample; for another, the next change without input.
 - the *gain*: the slope, with respect to the input, of the lowest time derivative of the output (or the earliest next
-  output) that depends on the input: η of Eq. (2), δ²/m of Eq. (1).
+  output) that depends on the input: η of Eq. (2), δ²/m of Eq. (1). Of several inputs it is the
+  slope with respect to all, which change alike.
 - the *regressors*: derivatives of the rates or next states with respect to the coefficients.
 - the *linear part*: their derivatives with respect to the states, at rest.
 """

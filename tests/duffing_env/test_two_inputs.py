@@ -15,6 +15,7 @@ from playing import assert_refused, random_actions
 from reference.plants import TWO_MASSES
 from specimens import TWO_FORCES
 
+from agents.evaluation.metrics import fisher_information_gain
 from agents.evaluation.policy_rollout import run_episodes
 from agents.policies import make_policy
 from agents.policies.signals import InputLimits, SignalPolicy
@@ -23,6 +24,7 @@ from duffing_env.experiment_config import SimulatedExperiment
 from duffing_env.storage.kernel_spec import observation_bounds
 from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
 from estimator.models.model import Model
+from estimator.models.named_parameters import Parameters
 
 LARGEST, SLEW = np.array([0.5, 0.2]), np.array([0.6, 0.15])
 BUDGET = TWO_FORCES["horizon"] * TWO_FORCES["max_rms"] ** 2
@@ -179,6 +181,13 @@ def test_a_law_plays_all_systems_within_the_budget():
         evaluation.metrics["input_power"], (evaluation.inputs**2).sum(axis=2).mean(axis=0), rtol=1e-12
     )
     assert (evaluation.metrics["information_gain"] > 1).all()
+    gains = fisher_information_gain(evaluation.inputs, played.truth, played.experiment, evaluation.outputs)
+    for i, gain in enumerate(gains):
+        one = Parameters({name: values[i : i + 1] for name, values in played.truth.items()})
+        series = (array[:, i : i + 1] for array in (evaluation.inputs, evaluation.outputs))
+        alone = fisher_information_gain(next(series), one, played.experiment, next(series))
+        assert gain == pytest.approx(alone.item(), rel=1e-9)
+    assert (np.abs(gains - evaluation.metrics["information_gain"]) < 3).all()
 
 
 def test_a_function_gives_an_action_for_each_input():
