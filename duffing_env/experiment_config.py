@@ -201,6 +201,7 @@ class Experiment:
             "prior_log_precisions": np.log(precisions[::2] / precisions[1::2]),
             "max_slew": np.full(model.n_inputs, np.inf),
             "sqrt_input_cost": np.zeros(model.n_inputs),
+            "sensor_limits": np.full(self.truth_model.n_outputs - 1, np.inf),
         }
         return KernelParams(**(values | plant_fields))
 

@@ -158,8 +158,9 @@ def _define_step_blocks(spec: KernelSpec) -> Any:
                     update_belief(W, params.iterations, params.as_published)
                 after_update(W, params)
                 finish_step(
-                    W, params.step, params.max_output, params.horizon, params.sqrt_input_cost, params.reward_weights
-                )
+                    W, params.step, params.max_output, params.horizon, params.sqrt_input_cost, params.sensor_limits,
+                    params.reward_weights,
+                )  # fmt: skip
                 if params.terminal or params.has_terminated_return:
                     pay_reward(W, params.terminal, params.has_terminated_return, params.terminated_return)
                 restore_broken_beliefs(W, workspace)

@@ -237,10 +237,11 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     for i, root in zip(model.inputs, cost_roots, strict=True):
         lines.append((f"EFFORT_{i}", symbol(root) * symbol(applied_row(i))))
         reward -= symbol(f"EFFORT_{i}") ** 2
-    first_sensor = next(iter(model.outputs))
-    is_beyond_limit = is_positive(symbol("VOID")) + is_positive(
-        sp.Abs(symbol(f"Y_{first_sensor}")) - symbol("max_output")
-    )
+    first_sensor, *further = model.outputs
+    limits = {first_sensor: "max_output"} | {y: f"limit_{y}" for y in further}
+    is_beyond_limit = is_positive(symbol("VOID"))
+    for y, limit in limits.items():
+        is_beyond_limit += is_positive(sp.Abs(symbol(f"Y_{y}")) - symbol(limit))
     is_at_horizon = sp.Function("reaches")(symbol("LATER"), symbol("horizon"))
     lines += [("PAID", reward), ("STOPPED", is_positive(is_beyond_limit)), ("LATER", symbol("ELAPSED_SAMPLES") + 1)]
     lines.append(("OVER", (1 - symbol("STOPPED")) * is_at_horizon))
@@ -254,9 +255,12 @@ def _step_outcome_source(spec: KernelSpec, loop: Any) -> str:
     results |= {"TRUNCATED": "OVER", "DIVERGED": "BROKEN", "ELAPSED_SAMPLES": "LATER"}
     uniform = ("step", "max_output", "horizon")
     doc = "The reward of a sample, and whether it ends the episode; a broken belief pays nothing and ends it."
-    source += loop("finish_step_lanes", doc, lines, results, *uniform, *cost_roots, *weight_names)
-    given = [*uniform, *(f"sqrt_input_cost[{k}]" for k in range(len(cost_roots))), *(f"weights[{k}]" for k in range(4))]
-    signature = ", ".join(["W", *uniform, "sqrt_input_cost", "weights"])
+    source += loop(
+        "finish_step_lanes", doc, lines, results, *uniform, *cost_roots, *map(limits.get, further), *weight_names
+    )
+    arrays = {"sqrt_input_cost": len(cost_roots), "sensor_limits": len(further), "weights": len(weight_names)}
+    given = [*uniform, *(f"{array}[{k}]" for array, size in arrays.items() for k in range(size))]
+    signature = ", ".join(["W", *uniform, *arrays])
     return source + f"@scalar_jit\ndef finish_step({signature}):\n    finish_step_lanes(W, {', '.join(given)})\n"
 
 

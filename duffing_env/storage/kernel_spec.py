@@ -99,6 +99,7 @@ class KernelParams(NamedTuple):
         prior_log_precisions: (1 + sensors,) logarithms of the prior's E[γ] and E[ξ].
         max_slew: (inputs,) largest changes of the inputs between samples.
         sqrt_input_cost: (inputs,) square roots of the costs of inputs of 1.
+        sensor_limits: (sensors - 1,) limits of the further sensors; infinite where there is none.
         hold: samples of an action.
         max_samples: samples after which an outer limit truncates an episode, as Gymnasium's ``TimeLimit`` does.
         process_noise: standard deviation of the effect of one sample's process noise on the first sensor.
@@ -133,6 +134,7 @@ class KernelParams(NamedTuple):
     prior_log_precisions: npt.NDArray[np.float64]
     max_slew: npt.NDArray[np.float64]
     sqrt_input_cost: npt.NDArray[np.float64]
+    sensor_limits: npt.NDArray[np.float64]
     hold: int = 1
     max_samples: float = np.inf
     process_noise: float = 0.0
@@ -157,6 +159,7 @@ def compile_unpacker(spec: KernelSpec) -> Any:
     n_sensors, n_parameters = spec.truth_model.n_outputs, len(parameter_names(spec.truth_model))
     sizes = {
         "measurement_noise": n_sensors,
+        "sensor_limits": n_sensors - 1,
         "nominal_parameters": n_parameters,
         "parameter_stds": n_parameters,
         "reward_weights": 4,

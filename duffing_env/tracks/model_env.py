@@ -20,7 +20,7 @@ from estimator.models.model import Model
 from estimator.priors import gaussian_moments, weak_prior
 from estimator.rigs.stated_units import model_near_one
 from estimator.rigs.units import Scales
-from estimator.support.argument_checks import check_choice, check_number, short_repr
+from estimator.support.argument_checks import MAX_MAGNITUDE, check_choice, check_number, short_repr
 from estimator.support.array_types import FloatArray
 
 
@@ -34,6 +34,7 @@ class ModelExperiment(SimulatedExperiment):
     sampling_step: float = 1.0
     interpolation: str = "zero_order"
     sensor_noise: tuple[float, ...] | None = None
+    sensor_limits: tuple[float, ...] | None = None
 
     #: A model may be too nonlinear for a linearised update.
     uses_cubature: ClassVar[bool] = True
@@ -55,14 +56,12 @@ class ModelExperiment(SimulatedExperiment):
         check_choice("interpolation", self.interpolation, ("zero_order", "linear"))
         if self.factorisation != "structured":
             raise ValueError(f"factorisation must be 'structured' for a model, but is {self.factorisation!r}")
-        further_noises = self.sensor_noise
-        if further_noises is not None and (
-            not isinstance(further_noises, list | tuple) or len(further_noises) != self.plant.n_outputs - 1
-        ):
-            sensors = list(self.plant.outputs)[1:]
-            raise ValueError(f"sensor_noise must be for the sensors {sensors}, but is {short_repr(further_noises)}")
-        for std in further_noises or ():
-            check_number("sensor_noise", std)
+        sensors = list(self.plant.outputs)[1:]
+        for name, further in (("sensor_noise", self.sensor_noise), ("sensor_limits", self.sensor_limits)):
+            if further is not None and (not isinstance(further, list | tuple) or len(further) != len(sensors)):
+                raise ValueError(f"{name} must be for the sensors {sensors}, but is {short_repr(further)}")
+            for number in further or ():
+                check_number(name, number, maximum=1e300 if name == "sensor_limits" else MAX_MAGNITUDE)
 
     @cached_property
     def plant(self) -> Model:
@@ -145,6 +144,8 @@ class ModelExperiment(SimulatedExperiment):
     def plant_params(self) -> dict[str, Any]:
         """The noises, and the range of the plants."""
         plant_fields = {**super().plant_params, "measurement_noise": np.array(self.noises)}
+        if self.sensor_limits is not None:
+            plant_fields["sensor_limits"] = np.array(self.sensor_limits, dtype=np.float64)
         if self.std is not None:
             scale = 0.0 if self.plant_spread == 0 else 1.0
             plant_fields["parameter_stds"] = scale * np.array([self.std[name] for name in parameter_names(self.plant)])
@@ -173,8 +174,8 @@ class ModelEnv(DuffingEnv):
 
     ## Episode end
 
-    Terminated at \|y\| > ``max_output`` of the first sensor, or at a number that is not finite; truncated after
-    ``horizon`` samples.
+    Terminated at \|y\| > ``max_output`` of the first sensor, where a further one exceeds its ``sensor_limits``, or at
+    a number that is not finite; truncated after ``horizon`` samples.
 
     ## Belief
 
@@ -202,6 +203,7 @@ class ModelEnv(DuffingEnv):
     | ``sampling_step`` | 1 | seconds between two samples |
     | ``interpolation`` | ``zero_order`` | or ``linear``: the input of a differential equation between samples |
     | ``sensor_noise`` | None | standard deviations of the further sensors; None: the first sensor's |
+    | ``sensor_limits`` | None | limits of the further sensors, in their units; None: they have none |
 
     >>> import gymnasium as gym
     >>> import duffing_env

@@ -78,7 +78,7 @@ class Lanes:
         weights = np.array(REWARDS[self.reward].weights)
         price = np.array([np.sqrt(input_cost)])
         self.code.finish_step(
-            self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, weights
+            self.rows.reshape(-1), SILVERBOX_SAMPLING_STEP, MAX_OUTPUT, float(HORIZON), price, np.empty(0), weights
         )
         forfeits = terminated_return is not None
         if terminal or forfeits:

@@ -98,6 +98,24 @@ def test_a_number_or_a_sequence_says_the_same_as_names():
     assert SimulatedExperiment(max_input={"u": 0.1}).max_inputs.tolist() == [0.1]
 
 
+def test_each_sensor_has_a_limit_of_its_own():
+    """An episode ends at the first sample that is beyond one of them."""
+    limits, ended_by = np.array([0.2, 0.1]), set()
+    wide, tight = ModelEnv(**WIDE), ModelEnv(**TWO_FORCES | {"max_output": 0.2, "sensor_limits": (0.1,)})
+    for seed in range(20):
+        for env in (wide, tight):
+            env.reset(seed=seed)
+        for action in random_actions(TWO_FORCES["horizon"] - 1, seed=seed, inputs=2)[:, 0]:
+            wide.step(action)
+            *_, terminated, _, _ = tight.step(action)
+            beyond = np.abs(wide._batch.row_matrix(["Y_y1", "Y_y2"])[0]) > limits
+            assert terminated == beyond.any()
+            if terminated:
+                ended_by.add(tuple(beyond.tolist()))
+                break
+    assert ended_by >= {(True, False), (False, True)}
+
+
 def test_rewards_and_histories_of_ones_own_have_a_column_for_each_input():
     seen = []
 
@@ -246,6 +264,11 @@ def test_wrong_numbers_of_inputs_are_named():
             "max_slew must be a number, or give one for each",
         ),
         (lambda: ModelEnv(**TWO_FORCES | {"max_slew": {"f1": 1, "f2": -1}}), "max_slew of f2 must be"),
+        (
+            lambda: ModelEnv(**TWO_FORCES | {"sensor_limits": (1.0, 1.0)}),
+            "sensor_limits must be for the sensors ['y2']",
+        ),
+        (lambda: ModelEnv(**TWO_FORCES | {"sensor_limits": (0,)}), "sensor_limits must be"),
         (lambda: InputLimits((0.1, -0.1)), "max_input must be positive"),
         (lambda: SignalPolicy("one", [lambda rng, n: np.zeros(n)], max_input=(0.1, 0.2)), "draw must be one for each"),
     ]
