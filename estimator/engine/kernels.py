@@ -233,9 +233,10 @@ def compile_linearised_filter(
     def make() -> str:
         from estimator.engine import printer_numba, symbolic, variational_rk4
         from estimator.engine.linearised_filter import linearised_filter_step
-        from estimator.engine.packed_filter import print_packed_filter
 
         if packed:
+            from estimator.engine.packed_filter import print_packed_filter
+
             return print_packed_filter(model, degree, follows_outputs, layout, lanes, variable_step, noise_ratios)
 
         lines, propagation = symbolic.propagate_sample(model, noise_ratios)
