@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import sympy as sp
 
+from estimator.engine.branch_functions import select
 from estimator.engine import symbolic
 from estimator.engine.storage_layout import cubature_order, input_row
 from estimator.engine.symbolic import (
@@ -29,7 +30,6 @@ from estimator.engine.symbolic import (
     Propagation,
     differentiate,
     is_negative,
-    select,
     substitute,
     symbol,
     symmetric_entry,

@@ -160,6 +160,7 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     import sympy as sp
 
     from estimator.engine import printer_numba, symbolic
+    from estimator.engine.branch_functions import select
     from estimator.engine.symbolic_ldl import ldl_factorise
 
     symbol, names = symbolic.symbol, list(model.coefficients)
@@ -193,10 +194,10 @@ def _information_source(model: Model, layout: Mapping[str, int]) -> str:
     lines += [("PRESENT_DET", now.determinant), ("DET_RATIO", with_future.determinant / symbol("PRESENT_DET"))]
     ratio = symbol("DET_RATIO")
     # `log` is for positive, normal numbers; comparisons with NaN are false.
-    known = symbolic.select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
-    known = symbolic.select(
+    known = select(1e300 - ratio, sp.Function("log")(ratio) / 2, sp.Float(DIVERGED_SCORE))
+    known = select(
         symbol("PRESENT_DET"),
-        symbolic.select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)),
+        select(ratio - 1e-300, known, sp.Float(DIVERGED_SCORE)),
         sp.Float(DIVERGED_SCORE),
     )
     lines.append(("NATS", known))

@@ -24,6 +24,7 @@ from dataclasses import replace
 
 import sympy as sp
 
+from estimator.engine.branch_functions import select
 from estimator.engine.inputs_at_end import inputs_at_end
 from estimator.engine.noise_iterations import iterate_noise_beliefs, sensor_free_energy
 from estimator.engine.printer_numba import is_numeral, print_expression
@@ -36,7 +37,6 @@ from estimator.engine.symbolic import (
     Propagation,
     differentiate,
     is_present,
-    select,
     symbol,
     symmetric_entry,
     zero_if_finite,

@@ -6,7 +6,7 @@ Each comes with the layout of its block ``W`` (`estimator.compilation.simd`), to
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -193,7 +193,7 @@ class LinearisedFilter:
     """The linearised Kalman filter at known coefficients, with likelihood and Fisher information.
 
     Attributes:
-        sample: ``sample(W)``: one sample of every lane.
+        sample: ``sample(W, STEPS)``: one sample of every lane, of a differential equation by that many Runge-Kutta steps.
         layout: row number of each quantity: the coefficients, the input, outputs, ``IS_COUNTED``, the noise
             variances ``PROCESS_VARIANCE`` and ``R_<sensor>``, the filter's state and its totals.
         lanes: lanes of the block.
@@ -242,11 +242,13 @@ def compile_linearised_filter(
         lines, propagation = symbolic.propagate_sample(model, noise_ratios)
         more, results = linearised_filter_step(model, propagation, degree, follows_outputs)
         span = symbolic.symbol("SAMPLE_LENGTH") if variable_step else symbolic.ONE
-        source = variational_rk4.print_integrator(model, degree, layout, lanes, None, span, noise_ratios)
+        step = symbolic.symbol("STEP")
+        source = variational_rk4.print_integrator(model, degree, layout, lanes, None, span, noise_ratios, step)
         source += printer_numba.print_lane_loop(
             "finish", lines + more, results, layout, lanes, doc="Predict, and add likelihood and information."
         )
-        return source + printer_numba.print_sample("sample(W)", model, "finish(W)")
+        return source + printer_numba.print_sample("sample(W, STEPS)", model, "finish(W)", steps="STEPS")
 
-    key = repr((model.digest, degree, follows_outputs, lanes, variable_step, noise_ratios, *(["packed"] * packed)))
-    return LinearisedFilter(load_generated(model.name, "path", key, make, RUNTIME_FUNCTIONS).sample, layout, lanes)
+    key = (replace(model, substeps=1).digest, degree, follows_outputs, lanes, variable_step, noise_ratios)
+    key_text = repr((*key, *(["packed"] * packed)))
+    return LinearisedFilter(load_generated(model.name, "path", key_text, make, RUNTIME_FUNCTIONS).sample, layout, lanes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
+from estimator.engine.branch_functions import positive_part
 from estimator.engine.inputs_at_end import inputs_at_end
 from estimator.engine.printer_numba import print_expression
 from estimator.engine.psd_projection import project_to_psd
@@ -15,7 +16,6 @@ from estimator.engine.symbolic import (
     Program,
     Propagation,
     differentiate,
-    positive_part,
     symbol,
     symmetric_entry,
 )

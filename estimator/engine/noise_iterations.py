@@ -7,7 +7,8 @@ from typing import NamedTuple
 import sympy as sp
 
 from estimator.compilation.elementary_functions import LOG_2PI
-from estimator.engine.symbolic import HALF, ONE, ZERO, Program, log1p, select, symbol, where_valid
+from estimator.engine.branch_functions import select
+from estimator.engine.symbolic import HALF, ONE, ZERO, Program, log1p, symbol, where_valid
 
 
 class NoiseIteration(NamedTuple):

@@ -11,12 +11,13 @@ from collections.abc import Mapping
 import sympy as sp
 
 from estimator.engine import printer_numba, symbolic
+from estimator.engine.branch_functions import positive_part
 from estimator.engine.inputs_at_end import inputs_at_end
 from estimator.engine.packed_arrays import PackedArrays, define, sum_of, upper_triangle_offset
 from estimator.engine.packed_rk4 import print_packed_integrator
 from estimator.engine.printer_numba import print_expression
 from estimator.engine.storage_layout import held_noise_rows, noise_ratio_rows
-from estimator.engine.symbolic import ZERO, Assignments, differentiate, positive_part, symbol
+from estimator.engine.symbolic import ZERO, Assignments, differentiate, symbol
 from estimator.models.model import Model
 
 
@@ -29,7 +30,7 @@ def print_packed_filter(
     variable_step: bool = False,
     noise_ratios: bool = False,
 ) -> str:
-    """Source of ``sample(W)``, as `estimator.engine.kernels.compile_linearised_filter` has it.
+    """Source of ``sample(W, STEPS)``, as `estimator.engine.kernels.compile_linearised_filter` has it.
 
     Args:
         model: the equation.
@@ -45,7 +46,7 @@ def print_packed_filter(
     source += writer.propagate() + writer.predict()
     for k in range(model.n_outputs):
         source += writer.show(k) + writer.weigh(k) + writer.condition(k)
-    return source + writer.finish() + printer_numba.print_sample("sample(W)", model, "finish(W)")
+    return source + writer.finish() + printer_numba.print_sample("sample(W, STEPS)", model, "finish(W)", steps="STEPS")
 
 
 class _FilterWriter:

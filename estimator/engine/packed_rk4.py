@@ -32,7 +32,7 @@ _REACH, _WEIGHT = "0.5*((S + 1)//2)", "(1 + (S + 1)//2 % 2)/6"
 def print_packed_integrator(
     model: Model, degree: int, layout: Mapping[str, int], lanes: int, variable_step: bool, noise_ratios: bool
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, TAU)``, as `variational_rk4.print_integrator` has them.
+    """Source of ``begin(W)`` and ``move(W, TAU, STEP)``, as `variational_rk4.print_integrator` has them.
 
     Q is in the rows ``NOISE_i_k`` of `estimator.engine.storage_layout.packed_rows`, unless the noise is held.
 
@@ -72,8 +72,8 @@ class _IntegratorWriter:
         entry = self.arrays.entry
         length = f"{entry('SAMPLE_LENGTH')}*" if variable_step else ""
         #: Length of a Runge-Kutta step [sampling steps].
-        self.step_text = f"{length}{1 / model.substeps!r}"
-        self.step_symbol = (symbol("SAMPLE_LENGTH") if variable_step else sp.S.One) / model.substeps
+        self.step_text = f"{length}STEP"
+        self.step_symbol = (symbol("SAMPLE_LENGTH") if variable_step else sp.S.One) * symbol("STEP")
 
     def _slopes(self) -> dict[tuple[str, str], sp.Expr]:
         """The entries of the Jacobian that are not 0."""
@@ -109,12 +109,12 @@ class _IntegratorWriter:
         return define("begin(W)", "The integrator at the start of a sample.", lines)
 
     def stage(self) -> str:
-        """Source of ``stage(W, TAU, REACH, WEIGHT, S)``: the model's own expressions at stage S."""
+        """Source of ``stage(W, TAU, STEP, REACH, WEIGHT, S)``: the model's own expressions at stage S."""
         model, c, h = self.model, differentiate(self.model), self.step_symbol
         at: dict[str, sp.Expr | str] = {i: f"STAGE_{i}" for i in self.states}
         at |= stage_inputs(model, "A")
         lines: Assignments = [
-            line for line in input_at_stages(model, self.degree, model.substeps) if line[0][-2:] == "_A"
+            line for line in input_at_stages(model, self.degree, symbol("STEP")) if line[0][-2:] == "_A"
         ]
         lines += [(f"STAGE_{i}", symbol(f"M_{i}") + symbol("REACH") * h * symbol(f"RATE_{i}")) for i in self.states]
         named = {f"RATE_{i}_e": move for i, move in zip(self.states, c.moves, strict=True)}
@@ -135,13 +135,13 @@ class _IntegratorWriter:
             end = symbol(f"STATE_END_{i}") + symbol("WEIGHT") * h * symbol(f"RATE_{i}_e")
             lines.append((f"STATE_END_{i}_e", end))
             results[f"STATE_END_{i}"] = f"STATE_END_{i}_e"
-        uniform, doc = ("TAU", "REACH", "WEIGHT", "S"), "The model's expressions at stage S of a step."
+        uniform, doc = ("TAU", "STEP", "REACH", "WEIGHT", "S"), "The model's expressions at stage S of a step."
         return printer_numba.print_lane_loop(
             "stage", lines, results, layout, self.lanes, uniform, doc, lane_index=INDEPENDENT_INDEX
         )
 
     def noise(self) -> str:
-        """Source of ``noise(W, NEXT_REACH, WEIGHT, S)``: the rates of Q at stage S, J Q + Q Jᵀ + g gᵀ.
+        """Source of ``noise(W, STEP, NEXT_REACH, WEIGHT, S)``: the rates of Q at stage S, J Q + Q Jᵀ + g gᵀ.
 
         ``COV`` is Q at the stage, square, and then Q at the next stage.
         """
@@ -176,7 +176,7 @@ class _IntegratorWriter:
             f"{entry(cov, place)} = Q",
             f"{entry(cov, f'(I + D)*{n} + I')} = Q",
         )
-        signature = "noise(W, NEXT_REACH, WEIGHT, S)"
+        signature = "noise(W, STEP, NEXT_REACH, WEIGHT, S)"
         return define(signature, "The rates of the process noise covariance at stage S.", lines)
 
     def effect(self, state: str | int, stage: int | str = "S") -> str:
@@ -184,7 +184,7 @@ class _IntegratorWriter:
         return self.arrays.entry(self.row("EFFECT_0"), f"{stage}*{len(self.states)} + {state}")
 
     def sensitivities(self) -> str:
-        """Source of ``sensitivities(W)``: F and the held noise's columns at the end of the step."""
+        """Source of ``sensitivities(W, STEP)``: F and the held noise's columns at the end of the step."""
         n, m, entry, loop, row = len(self.states), len(self.movers), self.arrays.entry, self.arrays.loop, self.row
         by, identity = row("END_BY"), row("IDENTITY")
         held_ends = [f"HELD_END{s}_{self.first}" for s in range(len(self.held))]
@@ -222,7 +222,7 @@ class _IntegratorWriter:
             )
         for rows, held in zip(self.held, held_ends, strict=True):
             lines += self.arrays.over_lanes(self._through_step(rows[0], 1, "0", [entry(held, a) for a in range(n)]))
-        return define("sensitivities(W)", "The derivatives at the end of a step.", lines)
+        return define("sensitivities(W, STEP)", "The derivatives at the end of a step.", lines)
 
     def _through_step(self, first_row: str, stride: int, column: str, added: Sequence[str] = ()) -> list[str]:
         """Statements that take a column of derivatives through the step, in place."""
@@ -235,7 +235,7 @@ class _IntegratorWriter:
         return statements + [f"{place} = AFTER_{a}" for a, place in enumerate(places)]
 
     def move(self) -> str:
-        """Source of ``move(W, TAU)``: one Runge-Kutta step."""
+        """Source of ``move(W, TAU, STEP)``: one Runge-Kutta step."""
         n, copy, row = len(self.states), self.arrays.copy, self.row
         lines = copy(row("STATE_END"), row("M"), n)
         if not self.held:
@@ -251,11 +251,14 @@ class _IntegratorWriter:
             "for S in range(4):",
             f"    REACH = {_REACH}",
             f"    WEIGHT = {_WEIGHT}",
-            f"    stage(W, TAU + REACH*{1 / self.model.substeps!r}, REACH, WEIGHT, S)",
+            "    stage(W, TAU + REACH*STEP, STEP, REACH, WEIGHT, S)",
         ]
         if not self.held:
-            lines += [f"    NEXT_REACH = {_REACH.replace('S + 1', 'S + 2')}", "    noise(W, NEXT_REACH, WEIGHT, S)"]
-        lines += ["sensitivities(W)", *copy(row("M"), row("STATE_END"), n)]
+            lines += [
+                f"    NEXT_REACH = {_REACH.replace('S + 1', 'S + 2')}",
+                "    noise(W, STEP, NEXT_REACH, WEIGHT, S)",
+            ]
+        lines += ["sensitivities(W, STEP)", *copy(row("M"), row("STATE_END"), n)]
         if not self.held:
             lines += copy(row("NOISE"), row("NOISE_END"), n * n)
-        return define("move(W, TAU)", "One Runge-Kutta step, from TAU in [0, 1) of the sample on.", lines)
+        return define("move(W, TAU, STEP)", "One Runge-Kutta step, from TAU in [0, 1) of the sample on.", lines)

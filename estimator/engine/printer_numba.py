@@ -23,7 +23,8 @@ _INLINE_TEMPLATES = {
     "zero_if_finite": "({0} - {0})",
     "below": "(0.0 if {0} >= 0.0 else 1.0)",
     "positive": "(1.0 if {0} > 0.0 else 0.0)",
-    "rectified": "(0.0 if {0} < 0.0 else {0})",
+    "positive_part": "(0.0 if {0} < 0.0 else {0})",
+    "exceeds": "(1.0 if {0} > {1} else 0.0)",
     "reaches": "(1.0 if {0} >= {1} else 0.0)",
     "select": "({1} if {0} > 0.0 else {2})",
     "where_valid": "({0} if {1} > 0.0 and {2} > 0.0 and {3} > 0.0 and {4} >= 0.0 and {5} >= 0.0 else NAN)",
@@ -159,7 +160,9 @@ def print_lane_loop(
     return "\n".join(source + [indent + line for line in body]) + "\n"
 
 
-def print_sample(signature: str, model: Model, finish_call: str, step_function: str = "move") -> str:
+def print_sample(
+    signature: str, model: Model, finish_call: str, step_function: str = "move", steps: str | None = None
+) -> str:
     """Source of a function over a sample: ``begin(W)``, all Runge-Kutta steps, and the call that finishes it.
 
     Args:
@@ -167,9 +170,12 @@ def print_sample(signature: str, model: Model, finish_call: str, step_function: 
         model: the equation; for a difference equation the function is ``finish_call`` alone.
         finish_call: the last call.
         step_function: name of ``step_function(W, TAU)``, one Runge-Kutta step from TAU in [0, 1) of the sample.
+        steps: name of the argument with the number of steps, of which ``step_function`` takes the length too; None for
+            the model's own number.
     """
-    steps = model.substeps
-    body = ["begin(W)", f"for s in range({steps}):", f"    {step_function}(W, s / {steps})"]
+    length = "" if steps is None else f", 1.0 / {steps}"
+    steps = steps or str(model.substeps)
+    body = ["begin(W)", f"for s in range({steps}):", f"    {step_function}(W, s / {steps}{length})"]
     body = [*(body if model.is_continuous else []), finish_call]
     return f"@scalar_jit\ndef {signature}:\n" + "".join(f"    {line}\n" for line in body)
 

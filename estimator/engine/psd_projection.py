@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import sympy as sp
 
-from estimator.engine.symbolic import ONE, ZERO, Program, clip, positive_part, select
+from estimator.engine.branch_functions import clip, positive_part, select
+from estimator.engine.symbolic import ONE, ZERO, Program
 
 
 def project_to_psd(program: Program, noise_cov: Sequence[Sequence[sp.Expr]]) -> tuple[tuple[sp.Expr, ...], ...]:
@@ -20,10 +21,10 @@ def project_to_psd(program: Program, noise_cov: Sequence[Sequence[sp.Expr]]) -> 
         entries[a, a] = program.assign(f"Q_PSD_{a}_{a}", positive_part(entries[a, a]))
     remaining = dict(entries)  # the Schur complement
     for a in range(n - 1):
+        std = program.assign(f"Q_ROOT_{a}_{a}", sp.sqrt(positive_part(remaining[a, a])))
         for b in range(a + 1, n):
-            largest = program.assign(
-                f"Q_LIMIT_{a}_{b}", sp.sqrt(positive_part(remaining[a, a])) * sp.sqrt(positive_part(remaining[b, b]))
-            )
+            root = program.assign(f"Q_ROOT_{a}_{b}", sp.sqrt(positive_part(remaining[b, b])))
+            largest = program.assign(f"Q_LIMIT_{a}_{b}", std * root)
             clipped = program.assign(f"Q_CLIPPED_{a}_{b}", clip(remaining[a, b], -largest, largest))
             entries[a, b] = (
                 program.assign(f"Q_PSD_{a}_{b}", entries[a, b] + (clipped - remaining[a, b])) if a else clipped

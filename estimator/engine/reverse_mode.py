@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import sympy as sp
 
-from estimator.engine.symbolic import Assignments, symbol
+from estimator.engine.branch_functions import positive_part, select
+from estimator.engine.symbolic import HALF, ZERO, Assignments, symbol
 
 
 def reverse_mode_derivative(
@@ -35,10 +36,18 @@ def reverse_mode_derivative(
             continue
         adjoint = symbol(f"ADJ_{name}")
         lines.append((str(adjoint), sum(parts, sp.S.Zero)))
-        inverted = expression.base if expression.is_Pow and expression.exp == -1 else None
+        base, factor = _outer_slope(name, expression)
         for used in sorted(expression.free_symbols, key=str):
-            # The slope of 1/x is -(1/x)², without another division.
-            slope = sp.diff(expression, used) if inverted is None else -(symbol(name) ** 2) * sp.diff(inverted, used)
+            slope = factor * sp.diff(base, used)
             adjoints.setdefault(str(used), []).append(slope * adjoint)
     lines += [(f"ADJ_{name}", sum(adjoints.get(name, []), sp.S.Zero)) for name in inputs]
     return lines
+
+
+def _outer_slope(name: str, expression: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
+    """An inner part of an expression, and the expression's slope by it, from the value that has been assigned."""
+    if expression.is_Pow and expression.exp == -1:  # -(1/x)², without another division
+        return expression.base, -(symbol(name) ** 2)
+    if expression.is_Pow and expression.exp == HALF and isinstance(expression.base, positive_part):
+        return expression.base, select(symbol(name), HALF / symbol(name), ZERO)  # finite at 0, where the value stays
+    return expression, sp.S.One

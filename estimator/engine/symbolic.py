@@ -38,18 +38,13 @@ Assignments = list[tuple[str, sp.Expr]]
 
 ZERO, ONE, HALF = sp.S.Zero, sp.S.One, sp.S.Half
 
-# Functions that `estimator.engine.printer_numba` writes out, without branches.
+# Functions that `estimator.engine.printer_numba` writes out, without branches; `estimator.engine.branch_functions` has
+# those with derivatives.
 
 #: ``is_present(x)``: 0 where x is NaN, else 1.
 is_present = sp.Function("present")
-#: ``select(x, a, b)``: a where x > 0, else b.
-select = sp.Function("select")
 #: ``is_negative(x)``: 1 where x is negative or NaN, else 0.
 is_negative = sp.Function("below")
-#: ``positive_part(x)``: x, or 0 where x is negative.
-positive_part = sp.Function("rectified")
-#: ``clip(x, low, high)``: x within these limits.
-clip = sp.Function("clip")
 #: ``where_valid(x, a, b, c, d, e)``: x where a, b and c are positive and d and e are not negative, else NaN.
 where_valid = sp.Function("where_valid")
 #: ``zero_if_finite(x)``: 0, or NaN where x is not finite.
@@ -234,7 +229,7 @@ def runge_kutta_4(
     variables: Sequence[str],
     rate_assignments: Assignments,
     model: Model,
-    substeps: int,
+    step_length: sp.Expr,
     sample_length: sp.Expr = sp.S.One,
 ) -> Assignments:
     """One Runge-Kutta step of order 4, from ``variables`` to ``<name>_END``.
@@ -245,10 +240,10 @@ def runge_kutta_4(
         variables: names that are integrated.
         rate_assignments: assignments of their rates ``RATE_<name>`` in the names and the inputs.
         model: the equation, for the names of its inputs, whose values at the stages `input_at_stages` assigns.
-        substeps: steps per sample.
+        step_length: length of the step, as a fraction of the sample.
         sample_length: length of the sample, in sampling steps.
     """
-    h = sample_length * sp.Rational(1, substeps)
+    h = sample_length * step_length
     lines: Assignments = []
     rates: list[dict[str, sp.Expr]] = []
     for k, fraction in enumerate((sp.S.Zero, sp.S.Half, sp.S.Half, sp.S.One)):
@@ -276,18 +271,17 @@ def runge_kutta_4(
     ]
 
 
-def input_at_stages(model: Model, degree: int, substeps: int) -> Assignments:
-    """`stage_inputs` at the start, middle and end of a Runge-Kutta step.
+def input_at_stages(model: Model, degree: int, step_length: sp.Expr) -> Assignments:
+    """`stage_inputs` at the start, middle and end of a Runge-Kutta step, whose length is a fraction of the sample.
 
     Raises:
         ValueError: for a model with the derivative of an input that is held (degree 0).
     """
     check_input_is_continuous(model, degree)
-    h = sp.Rational(1, substeps)
     lines = []
     for tag, fraction in (("A", sp.S.Zero), ("B", sp.S.Half), ("D", sp.S.One)):
         if degree and model.inputs:
-            lines.append((f"TAU_{tag}", symbol("TAU") + fraction * h))
+            lines.append((f"TAU_{tag}", symbol("TAU") + fraction * step_length))
         for i in model.inputs:
             value: sp.Expr = symbol(input_row(i, degree))
             for k in range(degree - 1, -1, -1):
@@ -320,10 +314,9 @@ def state_rk4_step(model: Model, degree: int) -> Assignments:
     """One Runge-Kutta step of the state alone."""
     at = {symbol(i): symbol(f"M_{i}") for i in model.states}
     rates = {f"RATE_M_{i}": move.xreplace(at) for i, move in zip(model.states, differentiate(model).moves, strict=True)}
-    stages = runge_kutta_4(
-        [f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model, model.substeps
-    )
-    return input_at_stages(model, degree, model.substeps) + stages
+    step = sp.Rational(1, model.substeps)
+    stages = runge_kutta_4([f"M_{i}" for i in model.states], eliminate_common_subexpressions(rates, "CSE"), model, step)
+    return input_at_stages(model, degree, step) + stages
 
 
 def propagate_state(model: Model, degree: int, row_of: Mapping[str, str]) -> tuple[Assignments, dict[str, str]]:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import sympy as sp
 
-from estimator.engine.symbolic import Assignments, select, symbol
+from estimator.engine.branch_functions import select
+from estimator.engine.symbolic import Assignments, symbol
 
 
 class LdlFactors(NamedTuple):

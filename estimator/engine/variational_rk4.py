@@ -61,8 +61,9 @@ def print_integrator(
     input_values: Mapping[str, Any] | None = None,
     sample_length: sp.Expr = sp.S.One,
     noise_ratios: bool = False,
+    step_length: sp.Expr | None = None,
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample.
+    """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample; with a step length, ``move(W, TAU, STEP)``.
 
     Args:
         model: the equation; the source is empty for a difference equation.
@@ -72,30 +73,45 @@ def print_integrator(
         input_values: ``U_<input>_<k>`` to an expression in other rows.
         sample_length: length of the sample, in sampling steps.
         noise_ratios: as for `estimator.engine.symbolic.propagate_sample`.
+        step_length: as for `variational_rk4_step`.
     """
     if not model.is_continuous:
         return ""
     start = {name: printer_numba.print_expression(value) for name, value in symbolic.integrator_start(model).items()}
     stepped = {name: f"{name}_END" for name in integrator_rows(model)}
-    step = symbolic.substitute(variational_rk4_step(model, degree, sample_length, noise_ratios), input_values or {})
+    step = variational_rk4_step(model, degree, sample_length, noise_ratios, step_length)
+    step = symbolic.substitute(step, input_values or {})
     source = printer_numba.print_lane_loop(
         "begin", [], start, layout, lanes, doc="The integrator at the start of a sample."
     )
     doc = "One Runge-Kutta step, from TAU in [0, 1) of the sample on."
-    return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, ("TAU",), doc)
+    uniform = ("TAU",) if step_length is None else ("TAU", str(step_length))
+    return source + printer_numba.print_lane_loop("move", step, stepped, layout, lanes, uniform, doc)
 
 
 def variational_rk4_step(
-    model: Model, degree: int, sample_length: sp.Expr = sp.S.One, noise_ratios: bool = False
+    model: Model,
+    degree: int,
+    sample_length: sp.Expr = sp.S.One,
+    noise_ratios: bool = False,
+    step_length: sp.Expr | None = None,
 ) -> Assignments:
-    """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_END``."""
-    states, h = list(model.states), sample_length * sp.Rational(1, model.substeps)
+    """One Runge-Kutta step of `estimator.engine.storage_layout.integrator_rows`, from ``<name>`` to ``<name>_END``.
+
+    Args:
+        model: the equation.
+        degree: degree of the input's polynomial.
+        sample_length: length of the sample, in sampling steps.
+        noise_ratios: as for `estimator.engine.symbolic.propagate_sample`.
+        step_length: symbol of the step's length, as a fraction of the sample; None for the model's own number of steps.
+    """
+    states, fraction = list(model.states), sp.Rational(1, model.substeps) if step_length is None else step_length
+    h = sample_length * fraction
     stage, slopes = _stage_rates_and_slopes(model, noise_ratios)
     held_columns = {f"{_HELD_NOISE}{s}": rows for s, rows in enumerate(held_noise_rows(model))}
     plain_variables = [f"M_{i}" for i in states] + ([] if model.held else upper_triangle_names("Q", states))
     lines = Program(
-        input_at_stages(model, degree, model.substeps)
-        + runge_kutta_4(plain_variables, stage, model, model.substeps, sample_length)
+        input_at_stages(model, degree, fraction) + runge_kutta_4(plain_variables, stage, model, fraction, sample_length)
     )
     total: _Slopes = dict.fromkeys(slopes, sp.S.Zero)
     stage_slopes: _Slopes = {}
@@ -179,7 +195,7 @@ def coarse_propagation(model: Model, degree: int) -> tuple[Assignments, symbolic
         Q = 6 H_A g gᵀ H_Aᵀ + 3/2 (H_B + H_C) g gᵀ (H_B + H_C)ᵀ + 6 H_D g gᵀ H_Dᵀ.
     """
     states = list(model.states)
-    lines = Program(symbolic.substitute(input_at_stages(model, degree, 1), {"TAU": sp.S.Zero}))
+    lines = Program(symbolic.substitute(input_at_stages(model, degree, sp.S.One), {"TAU": sp.S.Zero}))
     points = {tag: {i: symbol(f"{at}{i}") for i in states} for tag, at in (("A", ""), ("B", "MIDDLE_"), ("D", "END_"))}
     end = {symbol(i): value for i, value in points["D"].items()}
     effects = [[g.xreplace(end) for g in effect] for effect in noise_effects(model)]

@@ -6,16 +6,26 @@ The records run side by side in SIMD lanes. `estimator.engine.linearised_filter`
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.compilation.simd import jit, kernel
+from estimator.compilation.simd import kernel
 from estimator.engine.kernels import compile_linearised_filter
 from estimator.engine.storage_layout import first_input_row, known_inputs, likelihood_total_rows
 from estimator.inference.input_interpolation import record_lengths
+from estimator.inference.record_lanes import (
+    FIT_LANES,
+    RowOffsets,
+    initial_state_moments,
+    load_records,
+    load_sample,
+    store_results,
+    upper_triangle,
+)
 from estimator.models.model import MAX_INPUT_AGE, Model
 from estimator.support.argument_checks import check_mapping, to_float_array
 from estimator.support.array_types import FloatArray
@@ -85,165 +95,46 @@ def record_likelihoods(
         forecasts: (n, T, p, 2) receives the predictive mean and variance of each output.
         initial_state_slopes: (n, n_states, K) derivatives of ``initial_state`` by the coefficients; None for all 0.
     """
-    k, upper = model.n_coefficients, _upper_triangle(model.n_coefficients)
+    k, upper = model.n_coefficients, upper_triangle(model.n_coefficients)
     lengths = record_lengths(inputs)
     totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
-    initial_moments = _initial_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
+    begin = initial_state_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
     degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.inputs else 0
     outputs = np.zeros((0, 0, 0)) if y is None else y
     forecast_array = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
     lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
-    run = compile_record_filter(model, degree, y is not None, sample_lengths is not None)
-    run(coefficients, inputs, outputs, lengths_in_steps, lengths, initial_moments, noise_rows, totals, forecast_array)
+    run = compile_record_filter(in_single_steps(model), degree, y is not None, sample_lengths is not None)
+    steps = model.substeps
+    run(coefficients, inputs, outputs, lengths_in_steps, lengths, begin, noise_rows, steps, totals, forecast_array)
     information = np.empty((len(inputs), k, k))
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = totals[:, 1 + k : -1]
     return RecordLikelihoods(totals[:, 0], totals[:, 1 : 1 + k], information, totals[:, -1])
 
 
-def _initial_moments(
-    model: Model,
-    coefficients: FloatArray,
-    initial_state_cov: FloatArray,
-    initial_state: FloatArray | float,
-    slopes: FloatArray | None,
-) -> FloatArray:
-    """(n, rows) mean, packed covariance and, where there are slopes, sensitivities of the states at the start."""
-    n, moments = model.n_states, model.n_states + model.n_states * (model.n_states + 1) // 2
-    has_slopes = slopes is not None or bool(model.initial_states)
-    begin = np.zeros((len(coefficients), moments + n * model.n_coefficients * has_slopes))
-    begin[:, :n] = initial_state
-    cov = initial_state_cov.copy()
-    if has_slopes:
-        sensitivities = begin[:, moments:].reshape(len(begin), n, model.n_coefficients)
-        sensitivities[:] = 0.0 if slopes is None else slopes
-        for state, coefficient in model.initial_state_coefficients:
-            begin[:, state] = coefficients[:, coefficient]
-            cov[state, :] = cov[:, state] = 0.0
-            sensitivities[:, state] = np.arange(model.n_coefficients) == coefficient
-        begin[:, moments:] = sensitivities.reshape(len(begin), -1)
-    begin[:, n:moments] = cov[_upper_triangle(n)]
-    return begin
-
-
-#: (rows, columns) of the upper triangle of a square matrix.
-_upper_triangle = cache(np.triu_indices)
-
-#: Factor on the sensor's variance for a missing output [1].
-_MISSING_VARIANCE_FACTOR = 1e18
-
-#: Series side by side: one AVX-512 vector, since a fit has few series.
-_FIT_LANES = 8
-
-
-class _RowOffsets(NamedTuple):
-    """Sizes of the loop's quantities, and their first rows in the block; -1 for a row that is not there.
-
-    Attributes:
-        n_coefficients: coefficients.
-        n_outputs: sensors.
-        n_noises: noises of `record_likelihoods`.
-        n_totals: rows of `RecordLikelihoods`.
-        coefficient: first coefficient.
-        noise: variance of the process noise; the sensors' follow.
-        input: first row of the input.
-        sample_length: length of the sample.
-        is_counted: whether the sample counts.
-        first_total: first of the totals.
-        output: first output.
-        predicted_output: first predicted output.
-        predicted_variance: its variance without sensor noise.
-    """
-
-    n_coefficients: int
-    n_outputs: int
-    n_noises: int
-    n_totals: int
-    coefficient: int
-    noise: int
-    input: int
-    sample_length: int
-    is_counted: int
-    first_total: int
-    output: int
-    predicted_output: int
-    predicted_variance: int
-
-
-# The next functions do not depend on the model, and are compiled once for all models.
-
-
-@jit
-def _load_records(W, at, first, lanes, coefficients, lengths, initial_moments, noises):
-    """Load the series from ``first`` on side by side; returns the length of the longest."""
-    W[:] = 0.0
-    longest = 0
-    for j in range(_FIT_LANES):
-        i = first + min(j, lanes - 1)  # a spare lane repeats the last one
-        longest = max(longest, lengths[i])
-        W[at.is_counted * _FIT_LANES + j] = 1.0
-        for c in range(at.n_coefficients):
-            W[(at.coefficient + c) * _FIT_LANES + j] = coefficients[i, c]
-        for c in range(initial_moments.shape[1]):
-            W[c * _FIT_LANES + j] = initial_moments[i, c]
-        for c in range(at.n_noises):
-            W[(at.noise + c) * _FIT_LANES + j] = noises[i, c]
-    return longest
-
-
-@jit
-def _load_sample(W, at, first, lanes, t, inputs, y, sample_lengths, lengths, noises):
-    """Load sample t of each series."""
-    for j in range(_FIT_LANES):
-        i = first + min(j, lanes - 1)
-        is_active = t < lengths[i]
-        for c in range(inputs.shape[2]):
-            W[(at.input + c) * _FIT_LANES + j] = inputs[i, t, c] if is_active else 0.0
-        if at.sample_length >= 0:
-            W[at.sample_length * _FIT_LANES + j] = sample_lengths[i, t] if is_active else 1.0
-        if at.output >= 0:
-            is_complete = True
-            for c in range(at.n_outputs):
-                is_observed = is_active and not np.isnan(y[i, t, c])
-                is_complete = is_complete and is_observed
-                W[(at.output + c) * _FIT_LANES + j] = y[i, t, c] if is_observed else 0.0
-                W[(at.noise + 1 + c) * _FIT_LANES + j] = noises[i, 1 + c] * (
-                    1.0 if is_observed else _MISSING_VARIANCE_FACTOR
-                )
-            W[at.is_counted * _FIT_LANES + j] = 1.0 if is_complete else 0.0
-
-
-@jit
-def _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts):
-    """Store the forecasts of sample t, and the totals of series that end with it."""
-    for j in range(lanes):
-        if at.output >= 0 and len(forecasts) and t < lengths[first + j]:
-            for c in range(at.n_outputs):
-                forecasts[first + j, t, c, 0] = W[(at.predicted_output + c) * _FIT_LANES + j]
-                forecasts[first + j, t, c, 1] = (
-                    W[(at.predicted_variance + c) * _FIT_LANES + j] + noises[first + j, 1 + c]
-                )
-        if t + 1 == lengths[first + j]:
-            for c in range(at.n_totals):
-                totals[first + j, c] = W[(at.first_total + c) * _FIT_LANES + j]
-            for c in range(at.first_total):  # a finished series goes on at rest
-                W[c * _FIT_LANES + j] = 0.0
+@cache
+def in_single_steps(model: Model) -> Model:
+    """The model with one Runge-Kutta step per sample, for code that takes the number as an argument."""
+    return replace(model, substeps=1)
 
 
 @cache
 def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
-    """Compile the loop of `record_likelihoods`, with totals (n, 2 + K + K (K + 1)/2) packed."""
+    """Compile the loop of `record_likelihoods`, with totals (n, 2 + K + K (K + 1)/2) packed.
+
+    The number of Runge-Kutta steps is an argument, and the model's own does not count: `in_single_steps`.
+    """
     linearised_filter = compile_linearised_filter(
         model,
         degree,
         follows_outputs=follows_outputs,
-        lanes=_FIT_LANES,
+        lanes=FIT_LANES,
         variable_step=variable_step,
         noise_ratios=model.independent_noise,
     )
     sample, rows, size = linearised_filter.sample, linearised_filter.layout, len(linearised_filter.layout)
     sensor = next(iter(model.outputs))
-    at = _RowOffsets(
+    at = RowOffsets(
         n_coefficients=model.n_coefficients,
         n_outputs=model.n_outputs,
         n_noises=1 + model.n_outputs + len(model.noise_sources),
@@ -260,14 +151,14 @@ def compile_record_filter(model: Model, degree: int, follows_outputs: bool, vari
     )
 
     @kernel(variant=f"{model.name}_{model.digest}_{degree}_{int(follows_outputs)}_{int(variable_step)}")
-    def run(points, inputs, y, spans, lengths, begin, noises, totals, forecasts):
-        W = np.empty(size * _FIT_LANES)
-        for first in range(0, len(inputs), _FIT_LANES):
-            lanes = min(_FIT_LANES, len(inputs) - first)
-            for t in range(_load_records(W, at, first, lanes, points, lengths, begin, noises)):
-                _load_sample(W, at, first, lanes, t, inputs, y, spans, lengths, noises)
-                sample(W)
-                _store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts)
+    def run(points, inputs, y, spans, lengths, begin, noises, steps, totals, forecasts):
+        W = np.empty(size * FIT_LANES)
+        for first in range(0, len(inputs), FIT_LANES):
+            lanes = min(FIT_LANES, len(inputs) - first)
+            for t in range(load_records(W, at, first, lanes, points, lengths, begin, noises)):
+                load_sample(W, at, first, lanes, t, inputs, y, spans, lengths, noises)
+                sample(W, steps)
+                store_results(W, at, first, lanes, t, lengths, noises, totals, forecasts)
 
     return run
 

@@ -65,7 +65,7 @@ def walked(case, task, walks, observed):
     for t in range(SAMPLES):
         for lane, (_, _, _, inputs, _, y) in enumerate(walks):
             feed(case, task.layout, inputs[t], y[t] if observed else None, W, lane, lanes)
-        task.sample(W)
+        task.sample(W, case.model.substeps)
         if not observed:
             shown.append([W[task.layout[f"Y_PRED_{s}"] * lanes] for s in case.model.outputs])
     return W, np.array(shown)
@@ -131,7 +131,7 @@ def test_the_information_is_that_of_the_responses_slopes(name):
     start(case, task.layout, z, 0 * V, c, (0.0, *R), W)
     for taps in inputs:
         feed(case, task.layout, taps, None, W)
-        task.sample(W)
+        task.sample(W, case.model.substeps)
 
     def response(c):
         state, shown = z, []
@@ -214,7 +214,7 @@ def test_a_finished_lane_contributes_nothing():
     start(case, task.layout, z, V, c, (NOISE, *R), W)
     W[task.layout["IS_COUNTED"]] = 0.0
     feed(case, task.layout, inputs[0], y[0], W)
-    task.sample(W)
+    task.sample(W, case.model.substeps)
     totals = [
         W[place] for row, place in task.layout.items() if row == "LOSS" or row.startswith(("INFORMATION_", "GRADIENT_"))
     ]

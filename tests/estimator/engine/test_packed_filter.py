@@ -106,7 +106,7 @@ def test_sources_variances_scale_the_noise():
             W[task.layout[f"VARIANCE_RATIO_{source}"] * 8] = ratio
         for t in range(3):
             feed(case, task.layout, inputs[t], y[t], W, 0, 8)
-            task.sample(W)
+            task.sample(W, case.model.substeps)
         ends.append(np.array([W[task.layout[row] * 8] for row in ("LOSS", "GRADIENT_drag")]))
     np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
     assert (abs(ends[2] / ends[0] - 1) > 1e-3).any()
