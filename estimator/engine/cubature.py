@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import sympy as sp
 
-from estimator.engine.branch_functions import select
 from estimator.engine import symbolic
+from estimator.engine.branch_functions import select
 from estimator.engine.storage_layout import cubature_order, input_row
 from estimator.engine.symbolic import (
     HALF,

@@ -193,7 +193,7 @@ class LinearisedFilter:
     """The linearised Kalman filter at known coefficients, with likelihood and Fisher information.
 
     Attributes:
-        sample: ``sample(W, STEPS)``: one sample of every lane, of a differential equation by that many Runge-Kutta steps.
+        sample: ``sample(W, STEPS)``: one sample of every lane, in that many Runge-Kutta steps where it is continuous.
         layout: row number of each quantity: the coefficients, the input, outputs, ``IS_COUNTED``, the noise
             variances ``PROCESS_VARIANCE`` and ``R_<sensor>``, the filter's state and its totals.
         lanes: lanes of the block.

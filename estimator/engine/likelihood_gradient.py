@@ -126,6 +126,7 @@ def _backward_source(first: int, count: int) -> str:
         f"    for s in range(STEPS):\n        for i in range({count}):\n            tape[s, i] = W[{first} + i]\n"
         "        move(W, s / STEPS, 1.0 / STEPS)\n"
         "    finish_back(W)\n"
-        f"    for s in range(STEPS - 1, -1, -1):\n        for i in range({count}):\n            W[{first} + i] = tape[s, i]\n"
+        f"    for s in range(STEPS - 1, -1, -1):\n        for i in range({count}):\n"
+        f"            W[{first} + i] = tape[s, i]\n"
         "        move_back(W, s / STEPS, 1.0 / STEPS)\n    begin_back(W)\n"
     )

@@ -63,7 +63,7 @@ def print_integrator(
     noise_ratios: bool = False,
     step_length: sp.Expr | None = None,
 ) -> str:
-    """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample; with a step length, ``move(W, TAU, STEP)``.
+    """Source of ``begin(W)`` and ``move(W, TAU)``, which integrate a sample; or of ``move(W, TAU, STEP)``.
 
     Args:
         model: the equation; the source is empty for a difference equation.
@@ -73,7 +73,7 @@ def print_integrator(
         input_values: ``U_<input>_<k>`` to an expression in other rows.
         sample_length: length of the sample, in sampling steps.
         noise_ratios: as for `estimator.engine.symbolic.propagate_sample`.
-        step_length: as for `variational_rk4_step`.
+        step_length: as for `variational_rk4_step`; an argument of ``move``.
     """
     if not model.is_continuous:
         return ""

@@ -78,7 +78,8 @@ def compile_gradient(model: Model, degree: int, variable_step: bool = False) -> 
     n_kept, n_tape = adjoint.n_filter_state * FIT_LANES, adjoint.n_integrated * FIT_LANES
     n_filter_state, n_states, loss, misfit = adjoint.n_filter_state, model.n_states, rows["ADJ_LOSS"], rows["ADJ_NIS"]
     state_adjoint, coefficient_adjoint = (
-        rows[f"ADJ_{next(iter(names))}"] for names in (model.states, model.coefficients)
+        rows[f"ADJ_{next(iter(model.states))}"],
+        rows[f"ADJ_{next(iter(model.coefficients))}"],
     )
     at = RowOffsets(
         n_coefficients=model.n_coefficients,

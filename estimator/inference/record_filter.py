@@ -95,10 +95,10 @@ def record_likelihoods(
         forecasts: (n, T, p, 2) receives the predictive mean and variance of each output.
         initial_state_slopes: (n, n_states, K) derivatives of ``initial_state`` by the coefficients; None for all 0.
     """
+    begin = initial_state_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
     k, upper = model.n_coefficients, upper_triangle(model.n_coefficients)
     lengths = record_lengths(inputs)
     totals = np.zeros((len(inputs), len(likelihood_total_rows(model))))
-    begin = initial_state_moments(model, coefficients, initial_state_cov, initial_state, initial_state_slopes)
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
     degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.inputs else 0
     outputs = np.zeros((0, 0, 0)) if y is None else y

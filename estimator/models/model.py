@@ -142,7 +142,7 @@ class Model:
             raise ValueError(f"name must be a text, but is {short_repr(self.name)}")
         check_bool("held", self.held)
         check_bool("independent_noise", self.independent_noise)
-        check_integer("substeps", self.substeps, 1000)
+        check_integer("substeps", self.substeps, 10_000)
         for field_name, powers in self.dimensions.items():
             if isinstance(powers, str):
                 continue

@@ -1,9 +1,16 @@
-"""Stiff equations: however wrong the coefficients are, an innovation varies at least as much as its sensor's noise."""
+"""Stiff equations: however wrong the coefficients are, the likelihood has no hole, and its gradient is exact.
+
+An innovation varies at least as much as its sensor's noise. A hole is a point whose loss is lower than with 64 times as
+many Runge-Kutta steps as it asks for (8192 at most), by more than ten nats and a hundredth of its excess over the
+lowest loss possible. It attracts a fit where that excess is below 50 nats for each output.
+"""
 
 import numpy as np
 import pytest
 
 from estimator import Model
+from estimator.inference.converged_likelihood import converged_likelihoods, with_substeps
+from estimator.inference.likelihood_gradient import likelihood_gradients
 from estimator.inference.record_filter import record_likelihoods
 
 #: Decades to each side of a coefficient's value from which points are drawn.
@@ -48,6 +55,118 @@ CASES = {
     "motor": (MOTOR, (0.1, 0.002, 0.05, 0.01, 0.005, 1.0), (0.0, 0.0), lambda rng: held(rng, (-6.0, 6.0), 150)),
     "tanks": (TANKS, (0.05, 0.06, 0.01, 0.06, 0.05, 0.5), (2.0, 2.0), lambda rng: held(rng, (0.5, 4.0), 50)),
 }
+
+
+class Problem:
+    """A record of a case with 1 % noise, and points in four decades about each coefficient, with noises of six."""
+
+    def __init__(self, name, count, seed=0):
+        self.model, values, first, draw_input = CASES[name]
+        rng = np.random.default_rng(seed)
+        u = draw_input(rng)
+        values, self.n_samples = np.array(values), len(u)
+        response = np.empty((1, len(u), 1, 2))
+        nothing, first = np.full((1, len(u), 1), np.nan), np.array(first)
+        record_likelihoods(
+            with_substeps(self.model, 64), values[None], u[None, :, None], nothing, np.array([1e-20, 1.0]),
+            1e-12 * np.eye(2), first[None], forecasts=response,
+        )  # fmt: skip
+        self.std = 0.01 * response[..., 0].std()
+        y = response[0, :, :, 0] + self.std * rng.standard_normal((len(u), 1))
+        self.points = values * 10.0 ** rng.uniform(-DECADES, DECADES, (count, len(values)))
+        process_stds = self.std * 10.0 ** rng.uniform(-3, 3, count)
+        self.series = (
+            np.tile(u[None, :, None], (count, 1, 1)),
+            np.tile(y[None], (count, 1, 1)),
+            np.stack([process_stds, np.full(count, self.std)], axis=1) ** 2,
+        )
+        self.start = self.std**2 * np.eye(2), np.tile(first, (count, 1))
+
+    def run(self, function, substeps, chosen, points=None):
+        """A function of the filter's arguments, for some of the points, in a number of Runge-Kutta steps."""
+        at = self.points[chosen] if points is None else points
+        cov, first = self.start
+        return function(with_substeps(self.model, substeps), at, *(s[chosen] for s in self.series), cov, first[chosen])
+
+    def holes(self, loss, reference):
+        """Whether each loss is a hole, by a reference, and whether it is one that attracts a fit."""
+        lowest = self.n_samples * np.log(self.std)
+        is_hole = loss < reference - np.maximum(10.0, 0.01 * (reference - lowest))
+        return is_hole, is_hole & (loss - lowest < 50 * self.n_samples)
+
+    def holes_and_convergence(self):
+        """The `holes` of all losses, those of losses in single steps, and which losses have converged."""
+        every = np.arange(len(self.points))
+        found = self.run(converged_likelihoods, self.model.substeps, every)
+        reference = np.full(len(every), np.nan)
+        for substeps in set(found.substeps[found.substeps > 0]):
+            chosen = np.flatnonzero(found.substeps == substeps)
+            reference[chosen] = self.run(record_likelihoods, min(64 * int(substeps), 8192), chosen).loss
+        has_converged = found.substeps > 0
+        plain = self.run(record_likelihoods, self.model.substeps, every).loss
+        assert np.isinf(found.likelihoods.loss[~has_converged]).all()
+        assert not np.isnan(found.likelihoods.loss).any()
+        return self.holes(found.likelihoods.loss, reference), self.holes(plain, reference), has_converged
+
+
+@pytest.mark.parametrize(("name", "seed"), [("bioreactor", 0), ("motor", 0), ("tanks", 0)])
+def test_the_converged_likelihood_has_no_hole_where_that_in_single_steps_has_some(name, seed):
+    (_, attracting), (_, attracting_in_single_steps), has_converged = Problem(name, 100, seed).holes_and_convergence()
+    assert not attracting.any()
+    assert attracting_in_single_steps.any()
+    assert has_converged.mean() > 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_ten_thousand_points_have_no_hole(name):
+    counts = np.zeros(2)
+    for seed in range(10):
+        holes, _, has_converged = Problem(name, 1000, seed).holes_and_convergence()
+        counts += [kind.sum() for kind in holes]
+        assert has_converged.mean() > 0.6
+    assert counts[1] == 0
+    assert counts[0] < 100
+
+
+def checked_gradients(problem, function):
+    """Largest errors of gradients by differences, in parts of the largest slope, where differences agree.
+
+    They do not where a slope of the equation jumps, as at a full tank.
+    """
+    substeps = problem.run(converged_likelihoods, problem.model.substeps, np.arange(len(problem.points))).substeps
+    errors = []
+    for steps in set(substeps[(substeps > 0) & (substeps <= 64)]):
+        chosen = np.flatnonzero(substeps == steps)
+        points = problem.points[chosen]
+        slopes = points * problem.run(function, int(steps), chosen)
+        estimates = []
+        for width in (2e-5, 4e-5):
+            estimates.append(np.empty_like(slopes))
+            for k in range(points.shape[1]):
+                step = np.exp(width * (np.arange(points.shape[1]) == k))
+                losses = [
+                    problem.run(record_likelihoods, int(steps), chosen, points * step**j).loss for j in (-2, -1, 1, 2)
+                ]
+                estimates[-1][:, k] = np.array([1, -8, 8, -1]) @ losses / (12 * width)
+        size = np.abs(estimates[0]).max(axis=1)
+        agree = np.abs(estimates[0] - estimates[1]).max(axis=1) < 1e-7 * size
+        errors += list((np.abs(slopes - estimates[0]).max(axis=1) / size)[agree])
+    return np.array(errors)
+
+
+def held_gradients(*arguments):
+    """The gradient of the filter, which holds gains fixed."""
+    return record_likelihoods(*arguments).gradient
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_gradient_equals_differences(name):
+    problem = Problem(name, 24, seed=1)
+    errors = checked_gradients(problem, likelihood_gradients)
+    assert len(errors) > 5
+    assert errors.max() < 1e-6
+    assert np.median(checked_gradients(problem, held_gradients)) > 1e-3
 
 
 @pytest.mark.parametrize("name", CASES)
