@@ -59,7 +59,7 @@ def likelihood_gradients(
         inputs,
         y,
         np.zeros((0, 0)) if sample_lengths is None else sample_lengths,
-        record_lengths(inputs[:, :, 0]),
+        record_lengths(inputs),
         begin[:, :n_moments].copy(),
         noise_rows,
         np.broadcast_to((np.asarray(misfit_weights, dtype=np.float64) - 1) / 2, len(inputs)).copy(),
