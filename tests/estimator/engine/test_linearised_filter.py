@@ -56,13 +56,13 @@ def matrix(W, layout, lanes, lane, rows, columns):
     return np.array([[at(first[min(a, b)], first[max(a, b)]) for b in range(len(first))] for a in range(len(first))])
 
 
-def walked(case, task, walks, observed):
-    """Run lanes over their samples: the block, and the predicted outputs by sample."""
+def walked(case, task, walks, observed, samples=SAMPLES):
+    """Run lanes over their first samples: the block, and the predicted outputs by sample."""
     lanes = task.lanes
     W, shown = block(task.layout, lanes), []
     for lane, (z, V, c, _, R, _) in enumerate(walks):
         start(case, task.layout, z, V, c, (NOISE, *R), W, lane, lanes)
-    for t in range(SAMPLES):
+    for t in range(samples):
         for lane, (_, _, _, inputs, _, y) in enumerate(walks):
             feed(case, task.layout, inputs[t], y[t] if observed else None, W, lane, lanes)
         task.sample(W, case.model.substeps)
