@@ -31,8 +31,8 @@ def likelihood_gradients(
 ) -> FloatArray:
     """(n, K) exact gradients of the loss ½ Σ (w ν²/S + log S) of `estimator.inference.record_filter`, at w = 1.
 
-    The derivative is by the computed numbers, integration steps and all. It takes about three times as long as the loss
-    with its Fisher information. Arguments that are not named here are as for `record_likelihoods`.
+    The derivative is by the computed numbers, integration steps and all. It takes 2.5 to 6 times as long as the
+    loss with its Fisher information. Arguments that are not named here are as for `record_likelihoods`.
 
     Args:
         model: the equation.
@@ -51,7 +51,7 @@ def likelihood_gradients(
     n_moments = n + n * (n + 1) // 2
     slopes = begin[:, n_moments:].reshape(len(begin), -1, k)
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
-    degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.n_inputs else 0
+    degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.inputs else 0
     run = compile_gradient(in_single_steps(model), degree, sample_lengths is not None)
     adjoints = np.zeros((len(inputs), n + k))
     run(
