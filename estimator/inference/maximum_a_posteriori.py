@@ -5,21 +5,26 @@ Kalman filter and their variances S_t at the coefficients ψ it minimises
 
     L(ψ) = ½ Σ_t (ν_t² / S_t + log S_t) + ½ (ψ - ψ0)ᵀ Λ0 (ψ - ψ0)
 
-by Levenberg-Marquardt steps with the gradient and the information F of `estimator.inference.record_filter`. The search
-begins at the prior's mean and at further given points, and keeps the deepest minimum: with a wide prior, L has minima
-far from the truth. The inverse of Λ0 + F at the minimum is the covariance of Laplace's approximation.
+by Levenberg-Marquardt steps with the gradient and the information F of `estimator.inference.record_filter`, which hold
+gains fixed. The search begins at the prior's mean and at further given points, and keeps the deepest minimum: with a
+wide prior, L has minima far from the truth. From there the same steps go on with the exact gradient of
+`estimator.inference.likelihood_gradient`, which costs more, to where the slope of L vanishes; not for a model of more
+than 10 states, whose exact gradient compiles for minutes. The inverse of Λ0 + F there is the covariance of Laplace's
+approximation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from estimator.belief import Belief
 from estimator.engine.input_hold import input_degree
+from estimator.inference.likelihood_gradient import likelihood_gradients
 from estimator.inference.record_arrays import inputs_by_channel, outputs_by_sensor
 from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.model import Model
@@ -28,6 +33,9 @@ from estimator.support.array_types import FloatArray
 
 #: Upper limit of the steps of a search.
 _MAX_STEPS = 60
+
+#: States of a model up to which the search ends with exact gradients.
+_MAX_EXACT_STATES = 10
 
 #: Length of a step at which the search has converged [standard deviations of the posterior].
 _STEP_TOLERANCE = 1e-6
@@ -115,12 +123,14 @@ def maximum_a_posteriori(
         coefficients[:, free] += scale * points
         return coefficients
 
-    def loss_and_derivatives(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        filtered = record_likelihoods(model, coefficients_at(points), sample_inputs, outputs, noises, prior.state_cov)
+    def loss_and_derivatives(points: FloatArray, is_exact: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
+        arguments = model, coefficients_at(points), sample_inputs, outputs, noises, prior.state_cov
+        filtered = record_likelihoods(*arguments)
+        gradient = likelihood_gradients(*arguments) if is_exact else filtered.gradient
         prior_gradient = points @ precision
         loss = filtered.loss + 0.5 * (points * prior_gradient).sum(axis=1)
         curvature = filtered.information[:, free[:, None], free] * np.outer(scale, scale) + precision
-        return loss, scale * filtered.gradient[:, free] + prior_gradient, curvature
+        return loss, scale * gradient[:, free] + prior_gradient, curvature
 
     begins = [to_float_array(f"starts[{i}]", start) for i, start in enumerate(starts)]
     for i, begin in enumerate(begins):
@@ -134,6 +144,8 @@ def maximum_a_posteriori(
         others = _levenberg_marquardt(loss_and_derivatives, (begin[:, free] - center[free]) / scale)
         deeper = others[1] < loss - _MIN_LOSS_DIFFERENCE
         points[deeper], loss[deeper], curvature[deeper], converged[deeper] = (filtered[deeper] for filtered in others)
+    if model.n_states <= _MAX_EXACT_STATES:
+        points, _, curvature, converged = _levenberg_marquardt(partial(loss_and_derivatives, is_exact=True), points)
     posterior = np.zeros((len(inputs), *cov.shape))
     posterior[:, free[:, None], free] = np.linalg.inv(curvature) * np.outer(scale, scale)
     return MapEstimate(coefficients_at(points), posterior, converged)

@@ -31,6 +31,9 @@ _MAX_FACTOR = 1e3
 #: Largest change of a log noise in a round: the likelihood is flat where a noise is far too small.
 _MAX_LOG_CHANGE = 1.0
 
+#: Where the search by log noises stops: at this slope [nats]; not for a small change of a loss of thousands of nats.
+_STOP = {"ftol": 0.0, "gtol": 1e-4}
+
 #: Step of the finite differences by a log noise.
 _LOG_STEP = 1e-4
 
@@ -118,7 +121,7 @@ def profile_noises(prior: Belief, u: npt.ArrayLike, y: npt.ArrayLike, interpolat
             )
         low, high = np.maximum(logs - _MAX_LOG_CHANGE, lowest), np.minimum(logs + _MAX_LOG_CHANGE, highest)
         bounds = list(zip(low, high, strict=True))
-        best = minimize(loss_and_slopes, logs, (found.mean[0],), "L-BFGS-B", jac=True, bounds=bounds)
+        best = minimize(loss_and_slopes, logs, (found.mean[0],), "L-BFGS-B", jac=True, bounds=bounds, options=_STOP)
         change, logs, starts = float(np.abs(best.x - logs).max()), best.x, [found.mean]
         if change < _LOG_TOLERANCE:
             break

@@ -56,7 +56,7 @@ def test_the_same_is_found_from_a_start_beyond():
     u, y = record(2000, 1)
     near = stds(profile_noises(prior_of(PAIR), u, y))
     far = stds(profile_noises(prior_of(PAIR, 0.2, [0.3, 0.03]), u, y))
-    assert far == pytest.approx(near, rel=0.03)
+    assert far == pytest.approx(near, rel=0.003)
 
 
 def test_the_profiled_prior_predicts_another_record_better():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from playing import assert_refused
-from reference.filters import EPS, Plant, acting, input_seen, moved, path
+from reference.filters import EPS, Plant, acting, central, input_seen, moved, path
 from reference.plants import TWO_MASSES
 from reference.structured import Belief as ReferenceBelief
 from reference.structured import update
@@ -154,22 +154,24 @@ def test_a_free_run_is_that_with_matrices(case):
 
 @table("case", CASES)
 def test_a_fit_is_where_the_slope_vanishes(case):
-    """Of the likelihood with matrices and of the prior, by a thousandth of a standard deviation.
-
-    The search descends the loss along slopes at held gains, whose zero is off by the share of the gains' own slopes.
-    """
+    """Of the likelihood with matrices and of the prior, by central differences."""
     model, interpolation, coefficients = CASES[case]
     u, y = record(case, 60)
     prior, plant = prior_of(case), Plant.of(model)
     fit = maximum_a_posteriori(model, u[None], one_of(model, y)[None], prior, Q, R, interpolation)
     assert fit.converged.all()
     inputs = [acting(plant, u, t, interpolation) for t in range(len(u))]
-    found = path(
-        plant, np.zeros(model.n_states), prior.state_cov, fit.mean[0], inputs, Q**2, [R**2] * model.n_outputs, y
-    )
-    precision = np.linalg.inv(prior.coefficients_cov)
-    slope = found.gradient + precision @ (fit.mean[0] - prior.coefficients_mean)
-    assert np.abs(fit.cov[0] @ slope / np.sqrt(np.diag(fit.cov[0]))).max() < 1e-3
+    std, precision = np.sqrt(np.diag(fit.cov[0])), np.linalg.inv(prior.coefficients_cov)
+
+    def followed(at):
+        return path(plant, np.zeros(model.n_states), prior.state_cov, at, inputs, Q**2, [R**2] * model.n_outputs, y)
+
+    def loss(z):
+        pull = fit.mean[0] + std * z - prior.coefficients_mean
+        return followed(fit.mean[0] + std * z).loss + 0.5 * pull @ precision @ pull
+
+    assert np.abs(central(loss, np.zeros(len(std)), 0.01)).max() < 1e-6
+    found = followed(fit.mean[0])
     np.testing.assert_allclose(np.linalg.inv(fit.cov[0]), found.information + precision, rtol=1e-6, atol=1e-6)
     assert (np.abs(fit.mean[0] - coefficients) < 5 * np.sqrt(np.diag(fit.cov[0]))).all()
 
