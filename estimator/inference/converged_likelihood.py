@@ -57,6 +57,9 @@ def converged_likelihoods(
 ) -> ConvergedLikelihoods:
     """Run the linearised filter over n series, each with the Runge-Kutta steps that its error asks for.
 
+    It is for users who search far from the truth of a stiff equation, where too few steps may make a likelihood high.
+    It does not find every such hole: steps that agree with one another may all pass over a pole of the equation.
+
     The steps of a series are doubled, from the model's own on, until its loss ½ Σ (ν²/S + log S) has twice changed by
     no more than a tenth of a nat, or by 1e-4 of its misfit, and changes by no more with 16 times the steps. A
     difference equation has none. Arguments that are not named here are as for

@@ -120,7 +120,10 @@ def test_the_converged_likelihood_has_no_hole_where_that_in_single_steps_has_som
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_ten_thousand_points_have_few_holes(name):
-    """The motor has none; long steps over a pole at s = -k, or at an empty tank, leave some."""
+    """Less than a third of those in single steps, and the motor none.
+
+    Long steps over a pole at s = -k, or at an empty tank, leave some.
+    """
     counts = np.zeros((2, 2))
     for seed in range(10):
         converged, single_steps, has_converged = Problem(name, 1000, seed).holes_and_convergence()
