@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from playing import BY_HAND, continue_with, random_actions, roll_out
 from random_models import interpolation, random_model
-from reference.filters import EPS, Plant, acting, input_seen, moved, path
+from reference.likelihoods import STD, Q, R, assert_likelihood_is_that_with_matrices, simulated_record
 
 from duffing_env.batch import spawn_seeds
 from duffing_env.tracks.model_env import ModelEnv, ModelVectorEnv
 from estimator import Channel, OnlineEstimator, Rig
-from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.expression import FUNCTIONS
 from estimator.priors import weak_prior
 from estimator.rigs.units import Scales
@@ -17,20 +16,11 @@ from estimator.saving import load_estimator, save_estimator
 
 #: The first ones run always; a model takes half a minute to derive and compile.
 SEEDS = [0, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(50) if seed not in (0, 3))]
-#: Standard deviations of both noises and of the first state, in V.
-Q, R, STD = 2e-3, 1e-3, 1e-2
 
 
-def record(seed, samples=20):
-    """Inputs (T, inputs) and outputs (T, sensors) of a random model, with noise."""
-    (model, coefficients), plant = random_model(seed), Plant.of(random_model(seed)[0])
-    rng, z = np.random.default_rng(1), np.zeros(model.n_states)
-    u, y = rng.uniform(-0.4, 0.4, (samples, model.n_inputs)), np.empty((samples, model.n_outputs))
-    for t in range(samples):
-        inputs = acting(plant, u, t, interpolation(seed))
-        z = moved(plant, z, coefficients, inputs) + Q * plant.effects(z, coefficients).sum(1) * rng.standard_normal()
-        y[t] = plant.show(z, coefficients, input_seen(plant, inputs))
-    return u, y + R * rng.standard_normal(y.shape)
+def record(seed):
+    """Inputs (T, inputs) and outputs (T, sensors) of a random model."""
+    return simulated_record(*random_model(seed), interpolation(seed))
 
 
 def test_they_use_every_function():
@@ -43,22 +33,7 @@ def test_they_use_every_function():
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_compiled_likelihood_is_that_with_matrices(seed):
-    model, coefficients = random_model(seed)
-    between, plant = interpolation(seed), Plant.of(model)
-    u, y = record(seed)
-    cov = STD**2 * np.eye(model.n_states)
-    inputs = [acting(plant, u, t, between) for t in range(len(u))]
-    expected = path(plant, np.zeros(model.n_states), cov, coefficients, inputs, Q**2, [R**2] * model.n_outputs, y)
-    rows = inputs_by_sample(model, u[None], int(between == "linear"))
-    found = record_likelihoods(model, coefficients[None], rows, y[None], noise_variances(model, Q, R), cov)
-    # Some hundred operations a sample, whose rounding grows with the state's, and with the share of its variance that
-    # an output leaves.
-    allowed = 300 * len(u) * EPS * expected.growth * (STD / R) ** 2
-    np.testing.assert_allclose(found.loss[0], expected.loss, rtol=allowed, atol=allowed * len(u))
-    scale = np.sqrt(np.diag(expected.information))
-    scale[scale == 0] = 1.0  # of a state that no sensor sees
-    difference = (found.information[0] - expected.information) / np.outer(scale, scale)
-    np.testing.assert_allclose(difference, 0, atol=allowed)
+    assert_likelihood_is_that_with_matrices(*random_model(seed), interpolation(seed))
 
 
 @pytest.mark.parametrize("seed", SEEDS)

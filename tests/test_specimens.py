@@ -1,11 +1,12 @@
-"""What holds for every specimen: intervals that cover as often as they say."""
+"""What holds for every specimen: the likelihood is that with matrices, and intervals cover as often as they say."""
 
 import numpy as np
 import pytest
+from reference.likelihoods import assert_likelihood_is_that_with_matrices
 from scipy.stats import norm
 from specimens import SPECIMENS
 
-from duffing_env.tracks.model_env import ModelVectorEnv
+from duffing_env.tracks.model_env import ModelExperiment, ModelVectorEnv
 from estimator.rigs.physical_parameters import coefficients_of
 
 #: Limits that hardly an episode reaches, in the output's unit.
@@ -14,6 +15,14 @@ WIDE = dict.fromkeys(SPECIMENS, 5.0) | {
 }  # fmt: skip
 #: Torques in N m that move the double pendulum without ever turning it over.
 TORQUES = {"t1": 4.0, "t2": 2.0}
+
+
+@pytest.mark.parametrize("name", SPECIMENS)
+def test_the_compiled_likelihood_is_that_with_matrices(name):
+    experiment = ModelExperiment(**SPECIMENS[name])
+    model = experiment.model
+    coefficients = np.ravel(coefficients_of(model, SPECIMENS[name]["mean"], experiment.scales))
+    assert_likelihood_is_that_with_matrices(model, coefficients, "zero_order")
 
 
 @pytest.mark.slow
