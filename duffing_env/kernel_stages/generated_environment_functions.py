@@ -98,14 +98,15 @@ def _plant_source(model: Model, degree: int, loop: Any) -> str:
     noises = list(noise_std_rows(model))
     draws = [tuple(map(symbol, rows)) for rows in noise_draw_rows(model)]
     w, v = draws[0]
+    ends = {str(written): value for written, value in inputs_at_end(model, degree).items()}
     after: dict[str, Any] = {}
     for a, x in enumerate(model.states):
         kick = _noise_of_state(model, a, symbol(noises[0]), draws)
-        kick = symbolic.substitute([("", kick)], names)[0][1]
+        # A slope may hold an input, which is taken at the end of the sample.
+        kick = symbolic.substitute([("", kick)], names | ends)[0][1]
         lines.append((f"K_{x}", symbol(results[names[x]]) + kick))
         after[x] = symbol(f"K_{x}")
     results = {names[x]: f"K_{x}" for x in model.states}
-    ends = {str(written): value for written, value in inputs_at_end(model, degree).items()}
     source = ""
     for k, (y, output_expression) in enumerate(zip(model.outputs, derivatives.outputs, strict=True)):
         noise = (v, w)[k % 2] * symbol(noises[1 + k])
