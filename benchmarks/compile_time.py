@@ -15,7 +15,7 @@ from pathlib import Path
 
 from agents.cli import run_script
 from benchmarks.__main__ import describe_machine
-from benchmarks.peer_process import ROOT
+from benchmarks.peer_process import ROOT, unpack_version
 from benchmarks.section_tables import Claim, Section, print_section, ratio
 from benchmarks.timed_rounds import Row, measure
 
@@ -39,8 +39,7 @@ class Config:
 def main(config: Config) -> None:
     """Unpack the old version, time both, print."""
     with tempfile.TemporaryDirectory() as folder:
-        archive = subprocess.run(["git", "archive", config.commit], cwd=ROOT, capture_output=True, check=True).stdout
-        subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
+        unpack_version(config.commit, Path(folder))
         machine = describe_machine()
         print(f"{machine['processor']}, {machine['cores']} cores. Load before: {machine['load_before']}")
         print(f"Old is {config.commit}. Median [minimum, maximum] of {config.repetitions} repetitions, in turns.")

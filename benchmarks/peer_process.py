@@ -56,6 +56,12 @@ def _last_line(text: str) -> str:
     return lines[-1] if lines else "no reason given"
 
 
+def unpack_version(commit: str, folder: Path) -> None:
+    """Write the tree of a commit of this project into a folder."""
+    archive = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
+    subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
+
+
 class Child:
     """A process that runs rows, one request at a time (`benchmarks.peers` has the requests). A context manager.
 

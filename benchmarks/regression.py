@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from agents.cli import run_script
-from benchmarks.peer_process import ROOT
+from benchmarks.peer_process import ROOT, unpack_version
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ def main(config: Config) -> None:
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         tree.mkdir()
-        archive = subprocess.run(["git", "archive", config.commit], cwd=ROOT, capture_output=True, check=True).stdout
-        subprocess.run(["tar", "-x", "-C", tree], input=archive, check=True)
+        unpack_version(config.commit, tree)
         old = results_of(tree, Path(folder) / "old.npz")
         new = results_of(ROOT, Path(folder) / "new.npz")
     rows: dict[str, float] = {}

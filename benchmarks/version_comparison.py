@@ -3,7 +3,6 @@
 Each version runs in its own tree and process, and both are timed in turns.
 """
 
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from agents.cli import run_script
 from benchmarks.__main__ import describe_machine
-from benchmarks.peer_process import ROOT, Child
+from benchmarks.peer_process import ROOT, Child, unpack_version
 from benchmarks.section_tables import Claim, Section, print_section, ratio
 from benchmarks.timed_rounds import measure
 
@@ -40,8 +39,7 @@ class Config:
 def main(config: Config) -> None:
     """Unpack the old version, time both, print."""
     with tempfile.TemporaryDirectory() as folder:
-        archive = subprocess.run(["git", "archive", config.commit], cwd=ROOT, capture_output=True, check=True).stdout
-        subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
+        unpack_version(config.commit, Path(folder))
         command = [sys.executable, "-P", Path(__file__).with_name("version_rows.py")]
         trees = {"old": Path(folder), "new": ROOT}
         children = {age: Child(command, tree, {"PYTHONPATH": str(tree)}) for age, tree in trees.items()}

@@ -1,4 +1,4 @@
-"""The commands to kill: how each starts and resumes, what it has measured, and what a kill may lose."""
+"""The commands to kill: how each starts and resumes, what it has measured, and how much a kill may lose."""
 
 import csv
 import json

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from estimator.inference.record_filter import RecordLikelihoods, record_likelihoods
+from estimator.inference.record_filter import RecordLikelihoods, record_likelihoods, with_substeps
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
 
@@ -133,9 +131,3 @@ def _store(likelihoods: RecordLikelihoods, chosen: npt.NDArray[np.intp], new: Re
     """Overwrite the likelihoods of the chosen series."""
     for values, replacement in zip(likelihoods, new, strict=True):
         values[chosen] = replacement
-
-
-@cache
-def with_substeps(model: Model, substeps: int) -> Model:
-    """The model with a number of Runge-Kutta steps per sample."""
-    return replace(model, substeps=substeps)

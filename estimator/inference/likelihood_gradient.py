@@ -11,7 +11,7 @@ from estimator.compilation.simd import kernel
 from estimator.engine.likelihood_gradient import compile_likelihood_adjoint
 from estimator.engine.storage_layout import first_input_row
 from estimator.inference.input_interpolation import record_lengths
-from estimator.inference.record_filter import in_single_steps
+from estimator.inference.record_filter import with_substeps
 from estimator.inference.record_lanes import FIT_LANES, RowOffsets, initial_state_moments, load_records, load_sample
 from estimator.models.model import Model
 from estimator.support.array_types import FloatArray
@@ -52,7 +52,7 @@ def likelihood_gradients(
     slopes = begin[:, n_moments:].reshape(len(begin), -1, k)
     noise_rows = np.broadcast_to(noises, (len(inputs), 1 + model.n_outputs + len(model.noise_sources))).copy()
     degree = inputs.shape[2] // model.n_inputs - 1 if model.is_continuous and model.inputs else 0
-    run = compile_gradient(in_single_steps(model), degree, sample_lengths is not None)
+    run = compile_gradient(with_substeps(model, 1), degree, sample_lengths is not None)
     adjoints = np.zeros((len(inputs), n + k))
     run(
         coefficients,

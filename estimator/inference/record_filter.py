@@ -104,7 +104,7 @@ def record_likelihoods(
     outputs = np.zeros((0, 0, 0)) if y is None else y
     forecast_array = np.zeros((0, 0, 0, 0)) if forecasts is None else forecasts
     lengths_in_steps = np.zeros((0, 0)) if sample_lengths is None else sample_lengths
-    run = compile_record_filter(in_single_steps(model), degree, y is not None, sample_lengths is not None)
+    run = compile_record_filter(with_substeps(model, 1), degree, y is not None, sample_lengths is not None)
     steps = model.substeps
     run(coefficients, inputs, outputs, lengths_in_steps, lengths, begin, noise_rows, steps, totals, forecast_array)
     information = np.empty((len(inputs), k, k))
@@ -113,16 +113,16 @@ def record_likelihoods(
 
 
 @cache
-def in_single_steps(model: Model) -> Model:
-    """The model with one Runge-Kutta step per sample, for code that takes the number as an argument."""
-    return replace(model, substeps=1)
+def with_substeps(model: Model, substeps: int) -> Model:
+    """The model with a number of Runge-Kutta steps per sample; 1 for code that takes the number as an argument."""
+    return replace(model, substeps=substeps)
 
 
 @cache
 def compile_record_filter(model: Model, degree: int, follows_outputs: bool, variable_step: bool = False) -> Any:
     """Compile the loop of `record_likelihoods`, with totals (n, 2 + K + K (K + 1)/2) packed.
 
-    The number of Runge-Kutta steps is an argument, and the model's own does not count: `in_single_steps`.
+    The number of Runge-Kutta steps is an argument, and the model's own does not count: `with_substeps`.
     """
     linearised_filter = compile_linearised_filter(
         model,

@@ -68,7 +68,7 @@ class Masses:
         self.armed = False
 
     def play(self, u):
-        raise NotImplementedError
+        raise AssertionError("no sample is played before the checks")
 
 
 def test_a_plant_gets_each_input_in_its_unit_and_the_belief_is_that_of_the_record():

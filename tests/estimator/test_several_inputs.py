@@ -16,6 +16,7 @@ from estimator import Channel, OnlineEstimator, Rig
 from estimator.inference.batch_posteriors import posteriors
 from estimator.inference.fisher_information import fisher_information
 from estimator.inference.free_run import free_run, output_at
+from estimator.inference.input_interpolation import input_stencil
 from estimator.inference.maximum_a_posteriori import maximum_a_posteriori
 from estimator.inference.record_filter import inputs_by_sample, noise_variances, record_likelihoods
 from estimator.models.model import Model
@@ -221,8 +222,6 @@ def test_every_input_is_interpolated_as_one_alone(interpolation, delay):
 
 
 def test_a_spline_goes_through_each_input():
-    from estimator.inference.input_interpolation import input_stencil
-
     u = np.random.default_rng(3).standard_normal((30, 2))
     way = input_stencil(TWO_MASSES, Rig(0.01, "spline", 0, {"f1": Channel(), "f2": Channel()}))
     pieces = way.spline_coefficients(u)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from estimator import Model
-from estimator.inference.converged_likelihood import converged_likelihoods, with_substeps
+from estimator.inference.converged_likelihood import converged_likelihoods
 from estimator.inference.likelihood_gradient import likelihood_gradients
-from estimator.inference.record_filter import record_likelihoods
+from estimator.inference.record_filter import record_likelihoods, with_substeps
 
 #: Decades to each side of a coefficient's value from which points are drawn.
 DECADES = 2.0
